@@ -1,0 +1,85 @@
+"""Filter configuration: static capacities and choices, traced thresholds and noises.
+
+What is static (capacities, choices) compiles anew when changed. What is a number is traced: another value costs nothing, and
+any of them can be swept or differentiated.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+import numpy as np
+
+from vcjax.fields import number, require
+from vcjax.gates.gate import AbstractDetector, AbstractGate
+from vcjax.gates.inlier_ratio import InlierRatio
+from vcjax.gates.virtual_correction import VirtualCorrection
+
+
+class FilterConfig(eqx.Module):
+    """All that shapes a filter run beside its recording. The defaults are the paper's scenario."""
+
+    gate: AbstractGate = eqx.field(default_factory=VirtualCorrection)
+    """Which measurements correct the state."""
+    detector: AbstractDetector = eqx.field(default_factory=InlierRatio)
+    """Which landmarks are deleted over time."""
+
+    max_landmarks: int = eqx.field(static=True, default=64)
+    """Landmark slots. A full map is reported, and no feature is born until a slot is free."""
+    max_updates: int = eqx.field(static=True, default=10)
+    """Landmarks corrected per frame (Table 1: 10)."""
+    births_first_frame: int = eqx.field(static=True, default=10)
+    """Features initialised in the first frame (Table 1: 10)."""
+    births_per_frame: int = eqx.field(static=True, default=1)
+    """Features initialised in every other frame (Table 1: 1)."""
+    update: Literal["sequential", "stacked"] = eqx.field(static=True, default="sequential")
+    """Correct one landmark after another, each re-linearised at the state left by the one before; or all at once."""
+    choose_among: Literal["predicted", "measured"] = eqx.field(static=True, default="predicted")
+    """Choose the most uncertain among those predicted visible (one then not measured has used up its place), or among
+    those that also were measured."""
+    birth_order: Literal["lowest_id", "random"] = eqx.field(static=True, default="lowest_id")
+    """Which feature is initialised first: the lowest id, or a random order from the run's own key."""
+    retire: bool = eqx.field(static=True, default=True)
+    """Free the slot of a landmark after its track's last measurement in the recording: exact for everything else."""
+    blacklist_capacity: int = eqx.field(static=True, default=0)
+    """How many deleted features are remembered and never born again; 0: a deleted feature may come back."""
+    reverse_mode: bool = eqx.field(static=True, default=False)
+    """Make the run differentiable in reverse mode too (a bounded loop over recovered features instead of a free one)."""
+    toolbox_parity: bool = eqx.field(static=True, default=False)
+    """Use the scalar shortcut for derivatives of unit vectors, as the paper's toolbox does (see `frames.unit`)."""
+
+    pixel_std_px: float = eqx.field(converter=number, default=1.0)
+    """Standard deviation of a measured pixel, px (Table 1: 1.0); positive."""
+    oscillation_std_m: float = eqx.field(converter=number, default=0.0)
+    """Standard deviation of the commanded sideways displacement in each frame, m; 0: known exactly."""
+    inverse_depth_mean: float = eqx.field(converter=number, default=0.01)
+    """Inverse depth of a new landmark, 1/m; positive."""
+    inverse_depth_std: float = eqx.field(converter=number, default=0.5)
+    """Its standard deviation, 1/m; positive."""
+    inverse_depth_min: float = eqx.field(converter=number, default=0.001)
+    """What an inverse depth becomes that a correction made negative, 1/m; positive."""
+    linearity_max: float = eqx.field(converter=number, default=0.1)
+    """Linearity index below which an AHP landmark becomes Euclidean; at least 0 (0: never)."""
+    birth_margin_px: float = eqx.field(converter=number, default=25.6)
+    """Distance from every image border a new feature must keep, px; at least 0."""
+
+    def __check_init__(self):
+        for name in ("pixel_std_px", "inverse_depth_mean", "inverse_depth_std", "inverse_depth_min"):
+            require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
+        for name in ("oscillation_std_m", "linearity_max", "birth_margin_px"):
+            require(self, name, lambda v: np.isfinite(v) & (v >= 0), "give a number of at least 0.")
+        for name in ("max_landmarks", "max_updates"):
+            require(self, name, lambda n: n >= 1, "give a capacity of at least 1.")
+        for name in ("births_first_frame", "births_per_frame", "blacklist_capacity"):
+            require(self, name, lambda n: n >= 0, "give a count of at least 0.")
+        for name, choices in (
+            ("update", ("sequential", "stacked")),
+            ("choose_among", ("predicted", "measured")),
+            ("birth_order", ("lowest_id", "random")),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"FilterConfig({name}={getattr(self, name)!r}): choose one of {choices}.")
+        if self.max_updates > self.max_landmarks:
+            raise ValueError(
+                f"FilterConfig(max_updates={self.max_updates}) exceeds max_landmarks={self.max_landmarks}: "
+                "no more landmarks can be corrected than the map holds; raise max_landmarks."
+            )

@@ -1,0 +1,120 @@
+"""Features: predict every slot's pixel, and choose what to correct with."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vcjax.filter.config import FilterConfig
+from vcjax.filter.state import SLOT, VEHICLE, FilterState
+from vcjax.gates.gate import MeasurementModel
+from vcjax.models.camera import Camera, is_inside
+from vcjax.models.frames import unit, unit_jacobian
+from vcjax.models.landmarks import INVERSE_DEPTH, project_landmark
+
+
+class Block(NamedTuple):
+    """Mean of the 21 coordinates that a landmark's measurement depends on."""
+
+    vehicle: Float[Array, "14"]
+    landmark: Float[Array, "7"]
+    to_coordinates: Float[Array, "7 7"]
+
+
+class Observation(NamedTuple):
+    """A predicted measurement."""
+
+    pixel: Float[Array, "*b 2"]
+    is_visible: Bool[Array, "*b"]
+    """Inside the image and in front of the camera."""
+    H: Float[Array, "*b 2 21"]
+    """Derivative of the pixel by the errors of vehicle and slot."""
+
+
+def observe(config: FilterConfig, camera: Camera, block: Block) -> Observation:
+    """Predict a landmark's pixel, h(x) with its derivative H. Paper equation (8).
+
+    Within a frame corrections move the quaternions off unit length; measuring through q/|q|, whose derivative enters H,
+    makes h blind to their length, and they are normalised once, at the end of the frame.
+    """
+    robot, robot_H = _unit_pose(config, block.vehicle[:7])
+    sensor, sensor_H = _unit_pose(config, block.vehicle[7:])
+    pixel, depth, U_r, U_s, U_l = project_landmark(camera, robot, sensor, block.landmark)
+    H = jnp.concatenate(
+        [U_r[:, :3], U_r[:, 3:] @ robot_H, U_s[:, :3], U_s[:, 3:] @ sensor_H, U_l @ block.to_coordinates], axis=1
+    )
+    return Observation(pixel, is_inside(camera, pixel) & (depth > 0), H)
+
+
+def retract(config: FilterConfig, block: Block, shift: Float[Array, "21"]) -> Block:
+    """A block moved by a correction: x + K z (11); an inverse depth that became negative is set to a small positive one."""
+    landmark = block.landmark + block.to_coordinates @ shift[VEHICLE:]
+    rho = landmark[INVERSE_DEPTH]
+    landmark = landmark.at[INVERSE_DEPTH].set(jnp.where(rho > 0, rho, config.inverse_depth_min))
+    return Block(block.vehicle + shift[:VEHICLE], landmark, block.to_coordinates)
+
+
+def measurement_model(config: FilterConfig, camera: Camera) -> MeasurementModel:
+    """The measurement model that gates use on a candidate's block."""
+
+    def observe_block(block: Block):
+        observation = observe(config, camera, block)
+        return observation.pixel, observation.H
+
+    return MeasurementModel(observe=observe_block, retract=lambda block, shift: retract(config, block, shift))
+
+
+def _unit_pose(config: FilterConfig, pose: Float[Array, "7"]) -> tuple[Float[Array, "7"], Float[Array, "4 4"]]:
+    """A pose with its quaternion brought to unit length, and the derivative of that."""
+    q = pose[3:]
+    pose = jnp.concatenate([pose[:3], unit(q, config.toolbox_parity)])
+    return pose, unit_jacobian(q, config.toolbox_parity)
+
+
+class Prediction(NamedTuple):
+    """Every slot's predicted measurement at the state after prediction."""
+
+    is_visible: Bool[Array, " L"]
+    """Mapped and predicted inside the image."""
+    uncertainty: Float[Array, " L"]
+    """det(H P Hᵀ), px⁴."""
+
+
+def predict_features(config: FilterConfig, state: FilterState, camera: Camera) -> Prediction:
+    """Project all slots and their covariance H P Hᵀ (without pixel noise)."""
+    num_slots = state.track_id.shape[0]
+    is_mapped = state.is_mapped
+    # A free slot may hold anything: it is measured as a harmless point, so that no NaN arises where nothing is.
+    harmless = jnp.array([0, 0, 0, 1, 0, 0, 1], state.landmarks.dtype)
+    landmarks = jnp.where(is_mapped[:, None], state.landmarks, harmless)
+    blocks = Block(jnp.broadcast_to(state.vehicle, (num_slots, VEHICLE)), landmarks, state.to_coordinates)
+    observation = jax.vmap(lambda block: observe(config, camera, block))(blocks)
+
+    H_v, H_l = observation.H[..., :VEHICLE], observation.H[..., VEHICLE:]
+    P_vl = state.P[:VEHICLE, VEHICLE:].reshape(VEHICLE, num_slots, SLOT)
+    P_ll = state.P[VEHICLE:, VEHICLE:].reshape(num_slots, SLOT, num_slots, SLOT)
+    P_ll = P_ll[jnp.arange(num_slots), :, jnp.arange(num_slots), :]
+    cross = jnp.einsum("lav,vlj,lbj->lab", H_v, P_vl, H_l)
+    E = jnp.einsum("lav,vw,lbw->lab", H_v, state.P[:VEHICLE, :VEHICLE], H_v)
+    E = E + cross + cross.mT + jnp.einsum("lai,lij,lbj->lab", H_l, P_ll, H_l)
+    uncertainty = E[:, 0, 0] * E[:, 1, 1] - E[:, 0, 1] * E[:, 1, 0]
+    return Prediction(is_mapped & observation.is_visible, uncertainty)
+
+
+def match(state: FilterState, track_id: Int[Array, " V"], is_valid: Bool[Array, " V"]) -> Bool[Array, "L V"]:
+    """Which slot holds which measured feature."""
+    return state.is_mapped[:, None] & is_valid & (state.track_id[:, None] == track_id)
+
+
+def choose(
+    config: FilterConfig, prediction: Prediction, is_measured: Bool[Array, " L"]
+) -> tuple[Int[Array, " K"], Bool[Array, " K"]]:
+    """The K visible landmarks with the largest det(H P Hᵀ), most uncertain first, and which of the K there are.
+
+    The order is constant under differentiation. Slots that fill unused places are distinct from all others.
+    """
+    eligible = prediction.is_visible & (is_measured if config.choose_among == "measured" else True)
+    score = jnp.where(eligible, jax.lax.stop_gradient(prediction.uncertainty), -jnp.inf)
+    _, slot = jax.lax.top_k(score, config.max_updates)
+    return slot, eligible[slot]

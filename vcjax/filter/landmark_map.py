@@ -1,0 +1,126 @@
+"""The landmark map: birth, deletion, retirement. Slots change hands; P is touched only where a landmark is born."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from vcjax.filter.config import FilterConfig
+from vcjax.filter.state import FREE, SLOT, VEHICLE, FilterState, slot_rows
+from vcjax.models.camera import is_inside
+from vcjax.models.landmarks import INVERSE_DEPTH, back_project_landmark
+from vcjax.recording import Frame
+
+
+def delete(state: FilterState, is_deleted: Bool[Array, " L"]) -> FilterState:
+    """Free the slots of landmarks. What is left in their rows of P is inert, and overwritten at the next birth.
+
+    Removing rows and columns of a Gaussian is marginalisation: exact for everything that stays.
+    """
+    track_id = jnp.where(is_deleted, FREE, state.track_id)
+    return eqx.tree_at(lambda s: s.track_id, state, track_id)
+
+
+def ban(state: FilterState, is_banned: Bool[Array, " L"]) -> FilterState:
+    """Put the features of some slots on the blacklist, newest first; the oldest fall off when it is full."""
+    capacity = state.blacklist.shape[0]
+    if capacity == 0:
+        return state
+    everyone = jnp.concatenate([jnp.where(is_banned, state.track_id, FREE), state.blacklist])
+    newest_first = jnp.argsort(everyone == FREE, stable=True)
+    return eqx.tree_at(lambda s: s.blacklist, state, everyone[newest_first[:capacity]])
+
+
+def give_birth(
+    config: FilterConfig, state: FilterState, frame: Frame, is_mapped: Bool[Array, " V"], num_births: int
+) -> tuple[FilterState, Int[Array, " births"], Bool[Array, ""]]:
+    """Initialise up to `num_births` new landmarks from features that are not in the map. Paper's Table 1.
+
+    Eligible are measured features at least `birth_margin_px` inside the image and not on the blacklist; lowest id first, or
+    in random order.
+
+    Args:
+        config: priors, margin and order.
+        state: the state after the frame's corrections.
+        frame: measured features.
+        is_mapped: which of them the map holds already.
+        num_births: static number of attempts.
+
+    Returns: the state, the ids of those born (-1 for an attempt without a birth), and whether a feature had to wait
+    because the map is full.
+    """
+    is_eligible = frame.is_valid & ~is_mapped & is_inside(frame.camera, frame.uv_px, config.birth_margin_px)
+    is_eligible &= ~jnp.any(frame.track_id[:, None] == state.blacklist, axis=1)
+    rank = frame.track_id if state.key is None else _random_rank(state.key, frame.track_id)
+    last = jnp.iinfo(rank.dtype).max
+
+    def attempt(carry, _):
+        state, is_eligible = carry
+        column = jnp.argmin(jnp.where(is_eligible, rank, last))
+        is_free = ~state.is_mapped
+        slot = jnp.argmax(is_free)
+        is_born = is_eligible[column] & is_free[slot]
+        born_id = jnp.where(is_born, frame.track_id[column], FREE)
+        state = _initialise(config, state, frame, column, slot, is_born)
+        return (state, is_eligible.at[column].set(is_eligible[column] & ~is_born)), born_id
+
+    (state, is_waiting), born = jax.lax.scan(attempt, (state, is_eligible), None, length=num_births)
+    return state, born, jnp.any(is_waiting) & jnp.all(state.is_mapped)
+
+
+def _initialise(
+    config: FilterConfig,
+    state: FilterState,
+    frame: Frame,
+    column: Int[Array, ""],
+    slot: Int[Array, ""],
+    is_born: Bool[Array, ""],
+) -> FilterState:
+    """Write a new AHP landmark l(vehicle, pixel, ρ) into a slot; nothing where it is not born.
+
+    P_lX = L_m P_mX and P_ll = L_m P_mm L_mᵀ + L_y R L_yᵀ + σ_ρ² L_ρ L_ρᵀ with m the vehicle (robot and sensor).
+    """
+    uv_px = jnp.where(is_born, frame.uv_px[column], 0.0)
+
+    def back_project(vehicle, pixel):
+        return back_project_landmark(
+            frame.camera, vehicle[:7], vehicle[7:], pixel, config.inverse_depth_mean, config.toolbox_parity
+        )
+
+    landmark = back_project(state.vehicle, uv_px)
+    L_m, L_y = jax.jacfwd(back_project, argnums=(0, 1))(state.vehicle, uv_px)
+    variance = config.pixel_std_px**2 * (L_y @ L_y.T)
+    variance = variance.at[INVERSE_DEPTH, INVERSE_DEPTH].add(config.inverse_depth_std**2)
+
+    first = slot_rows(slot)
+    rows = L_m @ state.P[:VEHICLE]
+    own = rows[:, :VEHICLE] @ L_m.T + variance
+    rows = jax.lax.dynamic_update_slice_in_dim(rows, own, first, axis=1)
+    rows = jnp.where(is_born, rows, jax.lax.dynamic_slice_in_dim(state.P, first, SLOT))
+    P = jax.lax.dynamic_update_slice_in_dim(state.P, rows, first, axis=0)
+    P = jax.lax.dynamic_update_slice_in_dim(P, rows.T, first, axis=1)
+
+    def write(field: Array, value: Array) -> Array:
+        return field.at[slot].set(jnp.where(is_born, value, field[slot]))
+
+    return eqx.tree_at(
+        lambda s: (s.landmarks, s.to_coordinates, s.P, s.track_id, s.is_euclidean, s.detector),
+        state,
+        (
+            write(state.landmarks, landmark),
+            write(state.to_coordinates, jnp.eye(SLOT, dtype=P.dtype)),
+            P,
+            write(state.track_id, frame.track_id[column].astype(state.track_id.dtype)),
+            write(state.is_euclidean, jnp.zeros((), bool)),
+            jax.tree.map(write, state.detector, config.detector.born()),
+        ),
+    )
+
+
+def _random_rank(key: PRNGKeyArray, track_id: Int[Array, " V"]) -> Int[Array, " V"]:
+    """A random number for each id, the same in every frame."""
+
+    def rank(i):
+        return jax.random.randint(jax.random.fold_in(key, i), (), 0, jnp.iinfo(jnp.int32).max)
+
+    return jax.vmap(rank)(track_id)

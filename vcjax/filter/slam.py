@@ -1,0 +1,232 @@
+"""EKF-SLAM: `start` for the first frame, `step` for every other, `run` for a whole recording.
+
+One frame, in order: prediction (6) (7); every landmark's pixel predicted; the K most uncertain visible ones chosen; formal
+corrections (8)–(12), the gate's verdict (13) (14), corrections with the recovered; deletion of what gate or detector
+flagged; retirement of what will not be seen again; births.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from vcjax.filter import landmark_map
+from vcjax.filter.config import FilterConfig
+from vcjax.filter.correction import correct_frame
+from vcjax.filter.features import choose, match, predict_features
+from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state
+from vcjax.filter.submap import gather, normalise, scatter
+from vcjax.gates.gate import Evidence
+from vcjax.models.motion import move_by_odometry
+from vcjax.recording import Frame, Recording, validate
+
+
+class FrameInfo(eqx.Module):
+    """What a person wants to see of a frame. K candidates, L slots."""
+
+    vehicle: Float[Array, "14"]
+    """Robot and sensor pose at the end of the frame."""
+    vehicle_cov: Float[Array, "14 14"]
+    """Their covariance."""
+    candidate_id: Int[Array, " K"]
+    """Feature of each candidate for update, most uncertain first; -1 where there was none."""
+    is_measured: Bool[Array, " K"]
+    """Found in the image."""
+    pixel: Float[Array, "K 2"]
+    """Predicted pixel ê at the state it was tested at, px. Meaningless, like all below, where not measured."""
+    innovation: Float[Array, "K 2"]
+    """z = y - ê, px. Equation (8)."""
+    innovation_cov: Float[Array, "K 2 2"]
+    """Z = H P Hᵀ + R, px². Equation (9)."""
+    re1: Float[Array, " K"]
+    """RE₁ as gated. Equation (13)."""
+    re1_prior: Float[Array, " K"]
+    """RE₁ at the gate's prior, of the isolated; NaN elsewhere."""
+    re2: Float[Array, " K"]
+    """RE₂ of the isolated; NaN elsewhere. Equation (14)."""
+    is_accepted: Bool[Array, " K"]
+    """Corrected with directly."""
+    is_recovered: Bool[Array, " K"]
+    """Isolated, then corrected with."""
+    is_dynamic: Bool[Array, " K"]
+    """Isolated, called dynamic by the gate and deleted."""
+    inconsistent_id: Int[Array, " L"]
+    """Features deleted by the detector; -1 elsewhere."""
+    born_id: Int[Array, " births"]
+    """Features initialised; -1 for an attempt without a birth."""
+    num_landmarks: Int[Array, ""]
+    """Landmarks in the map at the end of the frame."""
+    map_is_full: Bool[Array, ""]
+    """Whether a feature waits for a free slot."""
+    is_finite: Bool[Array, ""]
+    """Whether the vehicle's mean and covariance are finite numbers."""
+
+
+def predict(config: FilterConfig, state: FilterState, frame: Frame) -> FilterState:
+    """Prediction: the robot moves by the odometry, the camera by its commanded displacement. Equations (6) and (7).
+
+    Only the robot's rows and columns of P change: P_r,all ← F P_r,all, P_rr += F_n N F_nᵀ.
+    """
+    robot = state.robot
+    F, F_n = jax.jacfwd(move_by_odometry, argnums=(0, 1))(robot, frame.odometry)
+    sensor = state.sensor.at[:3].add(frame.sensor_shift_m)
+    P = state.P.at[:7].set(F @ state.P[:7])
+    P = P.at[:, :7].set(P[:, :7] @ F.T)
+    P = P.at[:7, :7].add(F_n @ frame.odometry_cov @ F_n.T)
+    P = P.at[8, 8].add(config.oscillation_std_m**2)  # the lateral axis, y, of the sensor's position
+    vehicle = jnp.concatenate([move_by_odometry(robot, frame.odometry), sensor])
+    return eqx.tree_at(lambda s: (s.vehicle, s.P), state, (vehicle, P))
+
+
+def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[FilterState, FrameInfo]:
+    """One frame of EKF-SLAM.
+
+    Pure; works under `jit`, `vmap`, `scan` and differentiation (exact derivatives of all that is continuous; choices and
+    verdicts have zero derivative). Raises nothing: look at `is_finite` and `map_is_full`.
+
+    Args:
+        config: filter configuration.
+        state: state after the frame before, from `start` or `step`.
+        frame: odometry and features.
+
+    Returns: the state after this frame, and its info.
+    """
+    state = predict(config, state, frame)
+    prediction = predict_features(config, state, frame.camera)
+    matches = match(state, frame.track_id, frame.is_valid)
+    slot, is_searched = choose(config, prediction, jnp.any(matches, axis=1))
+    is_measured = is_searched & jnp.any(matches[slot], axis=1)
+    uv_px = frame.uv_px[jnp.argmax(matches[slot], axis=1)]
+
+    submap, rows = gather(state, slot)
+    submap, outcome = correct_frame(config, frame.camera, submap, uv_px, is_measured)
+    state = normalise(config, scatter(state, submap, slot, rows))
+    innovation, verdict = outcome.innovation, outcome.verdict
+
+    is_dynamic = jnp.zeros_like(prediction.is_visible).at[slot].set(verdict.is_dynamic)
+    is_visible = prediction.is_visible.at[slot].set(
+        jnp.where(is_measured, innovation.is_visible, prediction.is_visible[slot])
+    )
+    evidence = Evidence(
+        slot=slot,
+        is_searched=is_searched,
+        is_measured=is_measured,
+        is_corrected=outcome.is_accepted | verdict.is_recovered,
+        re1=innovation.re1,
+        is_visible=is_visible & ~is_dynamic,
+    )
+    detector, is_flagged = config.detector.observe(state.detector, evidence)
+    is_flagged &= state.is_mapped & ~is_dynamic
+    state = eqx.tree_at(lambda s: s.detector, state, detector)
+
+    info_of_candidates = dict(
+        candidate_id=jnp.where(is_searched, state.track_id[slot], FREE),
+        is_measured=is_measured,
+        pixel=innovation.pixel,
+        innovation=innovation.z,
+        innovation_cov=innovation.S,
+        re1=innovation.re1,
+        re1_prior=verdict.re1,
+        re2=verdict.re2,
+        is_accepted=outcome.is_accepted,
+        is_recovered=verdict.is_recovered,
+        is_dynamic=verdict.is_dynamic,
+        inconsistent_id=jnp.where(is_flagged, state.track_id, FREE),
+    )
+    is_deleted = is_dynamic | is_flagged
+    state = landmark_map.delete(landmark_map.ban(state, is_deleted), is_deleted)
+    is_mapped = jnp.any(matches & state.is_mapped[:, None], axis=0)
+    return _finish(config, state, frame, is_mapped, config.births_per_frame, info_of_candidates)
+
+
+def start(
+    config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None
+) -> tuple[FilterState, FrameInfo]:
+    """The first frame of a recording: its odometry, and the first births into the empty map.
+
+    Args:
+        config: filter configuration.
+        recording: what the run reads.
+        key: for a random order of births, and only then.
+
+    Returns: the state after the first frame, and its info.
+    """
+    state = initial_state(config, recording, key)
+    frame = recording.frame(0)
+    state = normalise(config, predict(config, state, frame))
+    K, dtype = config.max_updates, state.P.dtype
+    nobody, nothing = jnp.zeros(K, bool), jnp.full(K, jnp.nan, dtype)
+    info_of_candidates = dict(
+        candidate_id=jnp.full(K, FREE, jnp.int32),
+        is_measured=nobody,
+        pixel=jnp.zeros((K, 2), dtype),
+        innovation=jnp.zeros((K, 2), dtype),
+        innovation_cov=jnp.zeros((K, 2, 2), dtype),
+        re1=nothing,
+        re1_prior=nothing,
+        re2=nothing,
+        is_accepted=nobody,
+        is_recovered=nobody,
+        is_dynamic=nobody,
+        inconsistent_id=jnp.full(config.max_landmarks, FREE, jnp.int32),
+    )
+    is_mapped = jnp.zeros_like(frame.is_valid)
+    return _finish(config, state, frame, is_mapped, config.births_first_frame, info_of_candidates)
+
+
+def _finish(
+    config: FilterConfig,
+    state: FilterState,
+    frame: Frame,
+    is_mapped: Bool[Array, " V"],
+    num_births: int,
+    info_of_candidates: dict[str, Array],
+) -> tuple[FilterState, FrameInfo]:
+    """Births and retirement, and the frame's info."""
+    state, born, is_full = landmark_map.give_birth(config, state, frame, is_mapped, num_births)
+    attempts = max(config.births_first_frame, config.births_per_frame)
+    num_landmarks = jnp.sum(state.is_mapped)
+    if config.retire:
+        is_last = match(state, frame.track_id, frame.is_valid & frame.is_last)
+        state = landmark_map.delete(state, jnp.any(is_last, axis=1))
+    vehicle_cov = state.P[:VEHICLE, :VEHICLE]
+    info = FrameInfo(
+        vehicle=state.vehicle,
+        vehicle_cov=vehicle_cov,
+        born_id=jnp.full(attempts, FREE, born.dtype).at[:num_births].set(born),
+        num_landmarks=num_landmarks,
+        map_is_full=is_full,
+        is_finite=jnp.all(jnp.isfinite(state.vehicle)) & jnp.all(jnp.isfinite(vehicle_cov)),
+        **info_of_candidates,
+    )
+    return state, info
+
+
+def run(
+    config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None
+) -> tuple[FilterState, FrameInfo]:
+    """Filter a whole recording.
+
+    Args:
+        config: filter configuration.
+        recording: T frames.
+        key: for a random order of births, and only then.
+
+    Returns: the final state, and the info of every frame (leading axis T).
+
+    Raises:
+        ValueError: for a recording that no filter can run on (see `recording.validate`), before anything compiles.
+    """
+    validate(recording)
+    return _run(config, recording, key)
+
+
+@jax.jit
+def _run(config, recording, key):
+    state, first = start(config, recording, key)
+
+    def advance(state, t):
+        return step(config, state, recording.frame(t))
+
+    state, rest = jax.lax.scan(advance, state, jnp.arange(1, recording.num_frames))
+    return state, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)

@@ -1,0 +1,109 @@
+"""FilterState: what the next frame needs, and nothing else.
+
+The map has a fixed number L of slots of seven error coordinates each, so x and P have N = 14 + 7 L rows whatever the map
+holds: robot 7, sensor 7, then the slots (paper equations 2 and 3).
+
+A slot keeps the seven AHP error coordinates it was born with for life. When its landmark becomes Euclidean, p = f(x_AHP),
+only the mean changes its form; P keeps its seven rows and `to_coordinates` keeps J = ∂f/∂x_AHP, frozen at that moment. As
+Kalman updates are linear in the error, using H J with the old rows gives, ever after, exactly the numbers that P's rows
+transformed by J would give, and no pass over P is needed.
+
+A free slot's rows hold whatever they held before: the numbers of a landmark that is never looked at again. They are as
+inert as zeros would be, and cost nothing to leave.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+
+from vcjax.filter.config import FilterConfig
+from vcjax.recording import Recording
+
+VEHICLE = 14
+"""Error coordinates of robot and sensor."""
+SLOT = 7
+"""Error coordinates of a landmark slot."""
+FREE = -1
+"""Track id of a free slot."""
+
+
+class FilterState(eqx.Module):
+    """State mean x, covariance P and the map's book-keeping."""
+
+    vehicle: Float[Array, "14"]
+    """Robot pose T_w_r (7) and sensor pose T_r_s (7). Quaternions are of unit length between frames."""
+    landmarks: Float[Array, "L 7"]
+    """Landmark means, AHP or Euclidean in the common form (see `models.landmarks`)."""
+    to_coordinates: Float[Array, "L 7 7"]
+    """Derivative of a landmark's coordinates by its slot's error coordinates: I for AHP, [J; 0] for Euclidean."""
+    P: Float[Array, "N N"]
+    """Covariance of vehicle and slots' error coordinates."""
+    track_id: Int[Array, " L"]
+    """Which feature a slot holds; -1 where it is free."""
+    is_euclidean: Bool[Array, " L"]
+    """Whether a landmark has become Euclidean."""
+    detector: PyTree
+    """The detector's state of every slot."""
+    blacklist: Int[Array, " B"]
+    """Deleted features that must not be born again, newest first; -1 where empty."""
+    key: PRNGKeyArray | None
+    """Key of the random birth order; None where births go by id."""
+
+    @property
+    def is_mapped(self) -> Bool[Array, " L"]:
+        """Which slots hold a landmark."""
+        return self.track_id != FREE
+
+    @property
+    def robot(self) -> Float[Array, "7"]:
+        """Robot pose T_w_r."""
+        return self.vehicle[:7]
+
+    @property
+    def sensor(self) -> Float[Array, "7"]:
+        """Sensor pose T_r_s."""
+        return self.vehicle[7:]
+
+
+def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None) -> FilterState:
+    """The state before the first frame: start poses with their covariance, and an empty map.
+
+    Raises:
+        ValueError: if births are in random order and there is no key.
+    """
+    if (config.birth_order == "random") != (key is not None):
+        raise ValueError(
+            f"initial_state(key={key}): give a key if and only if births are in random order "
+            f"(FilterConfig(birth_order={config.birth_order!r}))."
+        )
+    num_slots = config.max_landmarks
+    vehicle = jnp.concatenate([recording.robot_start, recording.sensor_start])
+    dtype = vehicle.dtype
+    size = VEHICLE + SLOT * num_slots
+    P = jnp.zeros((size, size), dtype).at[:VEHICLE, :VEHICLE].set(recording.start_cov.astype(dtype))
+    return FilterState(
+        vehicle=vehicle,
+        landmarks=jnp.broadcast_to(jnp.array([0, 0, 0, 1, 0, 0, 1], dtype), (num_slots, SLOT)),
+        to_coordinates=jnp.broadcast_to(jnp.eye(SLOT, dtype=dtype), (num_slots, SLOT, SLOT)),
+        P=P,
+        track_id=jnp.full(num_slots, FREE, jnp.int32),
+        is_euclidean=jnp.zeros(num_slots, bool),
+        detector=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_slots, *leaf.shape)), config.detector.born()),
+        blacklist=jnp.full(config.blacklist_capacity, FREE, jnp.int32),
+        key=key,
+    )
+
+
+def slot_rows(slot: int | Int[Array, ""]) -> Int[Array, ""] | int:
+    """First row of a slot in P."""
+    return VEHICLE + SLOT * slot
+
+
+def landmark_cov(state: FilterState) -> Float[Array, "L 7 7"]:
+    """Covariance of each landmark's coordinates (the last four rows and columns are zero where Euclidean)."""
+    num_slots = state.track_id.shape[0]
+    blocks = state.P[VEHICLE:, VEHICLE:].reshape(num_slots, SLOT, num_slots, SLOT)
+    diagonal = blocks[jnp.arange(num_slots), :, jnp.arange(num_slots), :]
+    T = state.to_coordinates
+    return T @ diagonal @ T.mT

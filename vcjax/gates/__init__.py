@@ -1,0 +1,1 @@
+"""Accept, recover or call dynamic: update gates and detectors behind one contract each."""

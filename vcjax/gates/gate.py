@@ -1,0 +1,101 @@
+"""The two contracts of feature rejection: an update gate and a detector.
+
+A **gate** decides within one frame which measurements correct the state: it accepts a candidate by its RE₁, and passes a
+verdict on those it did not accept, each with its own 21-block of robot, sensor and landmark. A **detector** watches landmark
+slots over many frames, keeps a state for each, and flags the ones to delete. The two combine freely.
+
+A new gate or detector is one new file with one small class. All methods are pure, masked and batched; what is not a
+candidate must neither change a result nor a gradient.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+Prior = Literal["corrected", "predicted"]
+
+
+class MeasurementModel(NamedTuple):
+    """How a landmark's block is measured and moved."""
+
+    observe: Callable[[PyTree], tuple[Float[Array, "2"], Float[Array, "2 n"]]]
+    """Block mean to predicted pixel ê and its derivative H by the block's errors. Equation (8)."""
+    retract: Callable[[PyTree, Float[Array, " n"]], PyTree]
+    """Block mean moved by a correction K z. Equation (11)."""
+
+
+class Candidates(eqx.Module):
+    """The frame's K candidates, each with the block of the state it touches (robot, sensor, its landmark: n = 21)."""
+
+    mean: PyTree
+    """Block means, leading axis K; understood by the measurement model."""
+    P: Float[Array, "K n n"]
+    """Block covariances."""
+    uv_px: Float[Array, "K 2"]
+    """Measured pixels y."""
+    R: Float[Array, "2 2"]
+    """Pixel noise covariance W, px²."""
+    is_isolated: Bool[Array, " K"]
+    """Measured but not accepted: the candidates to judge. The others' numbers mean nothing."""
+
+
+class Verdict(eqx.Module):
+    """What a gate says of the isolated candidates."""
+
+    is_recovered: Bool[Array, " K"]
+    """To be corrected with after all."""
+    is_dynamic: Bool[Array, " K"]
+    """Moving: its landmark is deleted at once."""
+    re1: Float[Array, " K"]
+    """RE₁ at the gate's prior (13); NaN where not judged."""
+    re2: Float[Array, " K"]
+    """RE₂ after the virtual correction (14); NaN where not judged."""
+
+
+class AbstractGate(eqx.Module):
+    """Update gate: accept, recover or call dynamic."""
+
+    prior: eqx.AbstractVar[Prior]
+    """Where isolated candidates are judged: "corrected", after all formal corrections of the frame, with RE₁ < Th₁ tested
+    at the running state; or "predicted", with both at the state after prediction, as equation (13) is printed."""
+
+    @abstractmethod
+    def accepts(self, re1: Float[Array, "..."]) -> Bool[Array, "..."]:
+        """Whether a measurement with this squared Mahalanobis distance corrects the state directly."""
+
+    @abstractmethod
+    def judge(self, candidates: Candidates, model: MeasurementModel) -> Verdict:
+        """The verdict on each isolated candidate; false and NaN elsewhere."""
+
+
+class Evidence(eqx.Module):
+    """What a frame showed of the landmarks: K candidates, L slots."""
+
+    slot: Int[Array, " K"]
+    """Slot of each candidate; no slot comes twice."""
+    is_searched: Bool[Array, " K"]
+    """Chosen for update in this frame. The rest is false or meaningless where this is false."""
+    is_measured: Bool[Array, " K"]
+    """Found in the image."""
+    is_corrected: Bool[Array, " K"]
+    """Used in a formal correction, accepted or recovered."""
+    re1: Float[Array, " K"]
+    """RE₁ as gated (13)."""
+    is_visible: Bool[Array, " L"]
+    """Mapped and inside the image by its last projection."""
+
+
+class AbstractDetector(eqx.Module):
+    """Detector with a state for each landmark slot."""
+
+    @abstractmethod
+    def born(self) -> PyTree:
+        """State of one slot at its landmark's birth. Slots are reset to it; its structure is that of all states."""
+
+    @abstractmethod
+    def observe(self, state: PyTree, evidence: Evidence) -> tuple[PyTree, Bool[Array, " L"]]:
+        """New state (leading axis L) and the slots whose landmark is to be deleted."""
+

@@ -1,0 +1,58 @@
+"""The deletion rule of the paper's toolbox: a landmark that is searched often and fits seldom is inconsistent."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vcjax.fields import number, require
+from vcjax.gates.gate import AbstractDetector, Evidence
+
+
+class Counts(NamedTuple):
+    """How often a landmark was searched, found in the image, and used in a correction."""
+
+    searched: Float[Array, "..."]
+    measured: Float[Array, "..."]
+    corrected: Float[Array, "..."]
+
+
+class InlierRatio(AbstractDetector):
+    """Flag a visible landmark, searched at least `min_searches` times, that was found or fitted too seldom.
+
+    Flagged when measured/searched < `min_measured_ratio` or corrected/measured < `min_corrected_ratio`. All counts start at
+    one. Its decisions have zero derivative.
+    """
+
+    min_searches: float = eqx.field(converter=number, default=10.0)
+    """Searches before the rule applies; infinity switches it off."""
+    min_measured_ratio: float = eqx.field(converter=number, default=0.1)
+    """Smallest share of searches that find the landmark, in [0, 1]."""
+    min_corrected_ratio: float = eqx.field(converter=number, default=0.5)
+    """Smallest share of finds that are used in a correction, in [0, 1]."""
+
+    def __check_init__(self):
+        require(self, "min_searches", lambda n: n >= 0, "give a number of searches, or infinity to switch the rule off.")
+        for ratio in ("min_measured_ratio", "min_corrected_ratio"):
+            require(self, ratio, lambda r: (r >= 0) & (r <= 1), "a ratio lies in [0, 1].")
+
+    def born(self) -> Counts:
+        """One of each, as if the landmark had been searched, found and fitted once."""
+        return Counts(jnp.ones(()), jnp.ones(()), jnp.ones(()))
+
+    def observe(self, state: Counts, evidence: Evidence) -> tuple[Counts, Bool[Array, " L"]]:
+        """Count this frame's candidates and flag by the ratios."""
+
+        def count(total, happened):
+            return total.at[evidence.slot].add((happened & evidence.is_searched).astype(total.dtype))
+
+        state = Counts(
+            count(state.searched, evidence.is_searched),
+            count(state.measured, evidence.is_measured),
+            count(state.corrected, evidence.is_corrected),
+        )
+        is_inconsistent = (state.measured < self.min_measured_ratio * state.searched) | (
+            state.corrected < self.min_corrected_ratio * state.measured
+        )
+        return state, evidence.is_visible & (state.searched >= self.min_searches) & is_inconsistent

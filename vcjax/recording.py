@@ -1,0 +1,177 @@
+"""Recording: everything a filter run reads, simulated or real; and Truth, what a simulation knows beside it.
+
+This is the one seam between where data comes from and what is done with it. A filter cannot tell a simulated recording
+from a real one.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vcjax.fields import is_concrete
+from vcjax.models.camera import Camera
+from vcjax.models.frames import Pose
+
+
+class Frame(eqx.Module):
+    """One frame of a recording: the odometry that led to it and the features seen in it."""
+
+    odometry: Float[Array, "6"]
+    odometry_cov: Float[Array, "6 6"]
+    sensor_shift_m: Float[Array, "3"]
+    track_id: Int[Array, " V"]
+    uv_px: Float[Array, "V 2"]
+    is_valid: Bool[Array, " V"]
+    is_last: Bool[Array, " V"]
+    camera: Camera
+
+
+class Recording(eqx.Module):
+    """Odometry and feature tracks of T frames with at most V features each, and the calibration.
+
+    The poses and their covariance are those before the first frame, whose odometry leads from there to the first image.
+    """
+
+    time_s: Float[Array, " T"]
+    """Time of each frame, s."""
+    odometry: Float[Array, "T 6"]
+    """Robot-frame increment since the frame before: Δposition (m), Δrotation vector (rad)."""
+    odometry_cov: Float[Array, "T 6 6"]
+    """Covariance of the odometry, per frame."""
+    sensor_shift_m: Float[Array, "T 3"]
+    """Commanded displacement of the camera in the robot frame since the frame before, m (the oscillation)."""
+    track_id: Int[Array, "T V"]
+    """Identity of each feature; the same number in two frames is the same feature. At least 0 where valid."""
+    uv_px: Float[Array, "T V 2"]
+    """Pixel of each feature; anything where not valid."""
+    is_valid: Bool[Array, "T V"]
+    """Whether the entry holds a measured feature."""
+    is_last: Bool[Array, "T V"]
+    """Whether the feature is never seen again in this recording (see `last_sightings`); all false where nobody knows."""
+    camera: Camera
+    """Calibration."""
+    robot_start: Pose
+    """Robot pose T_w_r before the first frame."""
+    sensor_start: Pose
+    """Sensor pose T_r_s before the first frame (the mount)."""
+    start_cov: Float[Array, "14 14"]
+    """Covariance of robot and sensor pose before the first frame."""
+
+    @property
+    def num_frames(self) -> int:
+        """T, the number of frames."""
+        return self.odometry.shape[-2]
+
+    def frame(self, t: int | Int[Array, ""]) -> Frame:
+        """Frame t, 0 ≤ t < T."""
+        per_frame = (f.name for f in dataclasses.fields(Frame) if f.name != "camera")
+        return Frame(camera=self.camera, **{name: jnp.asarray(getattr(self, name))[t] for name in per_frame})
+
+
+class Truth(eqx.Module):
+    """What really happened, known in simulation only."""
+
+    robot: Float[Array, "T 7"]
+    """Robot pose T_w_r of each frame."""
+    sensor: Float[Array, "T 7"]
+    """Sensor pose T_r_s of each frame."""
+    landmarks_m: Float[Array, "T F 3"]
+    """Place of every feature in each frame; feature number = track id."""
+    is_moving: Bool[Array, " F"]
+    """Whether a feature moves at any time."""
+
+
+def last_sightings(track_id: Int[Array, "T V"], is_valid: Bool[Array, "T V"]) -> Bool[Array, "T V"]:
+    """Which entries are the last valid one of their track in a recording that is known to its end.
+
+    The filter frees a landmark's slot there, so that the map need only hold what is still to be seen.
+    """
+    shape = np.shape(track_id)
+    track_id, is_valid = np.ravel(track_id), np.ravel(is_valid)
+    # In reversed order the first occurrence of an id is its last sighting.
+    entries = np.flatnonzero(is_valid)[::-1]
+    _, first = np.unique(track_id[entries], return_index=True)
+    is_last = np.zeros(track_id.shape, bool)
+    is_last[entries[first]] = True
+    return is_last.reshape(shape)
+
+
+def validate(recording: Recording) -> None:
+    """Refuse a recording that no filter can run on.
+
+    Raises:
+        ValueError: naming field, place, value and remedy: shapes that disagree, no frames, times that do not grow, a
+            non-finite number where one is needed (pixels count only where valid), negative or repeated ids in a frame,
+            covariances with negative diagonal, quaternions that are not of unit length. Traced recordings are not checked.
+    """
+    leaves = jax.tree.leaves(recording)
+    if not all(is_concrete(leaf) for leaf in leaves):
+        return
+    num_frames = np.shape(recording.time_s)[0] if np.ndim(recording.time_s) == 1 else None
+    if num_frames == 0:
+        raise ValueError("Recording(time_s=[]): the recording is empty; give at least one frame.")
+    num_features = np.shape(recording.track_id)[-1] if np.ndim(recording.track_id) == 2 else None
+    shapes = {
+        "time_s": (num_frames,),
+        "odometry": (num_frames, 6),
+        "odometry_cov": (num_frames, 6, 6),
+        "sensor_shift_m": (num_frames, 3),
+        "track_id": (num_frames, num_features),
+        "uv_px": (num_frames, num_features, 2),
+        "is_valid": (num_frames, num_features),
+        "is_last": (num_frames, num_features),
+        "robot_start": (7,),
+        "sensor_start": (7,),
+        "start_cov": (14, 14),
+    }
+    for name, shape in shapes.items():
+        found = np.shape(getattr(recording, name))
+        if found != shape:
+            raise ValueError(f"Recording({name}) has shape {found}, but {shape} is needed (T frames first, from time_s).")
+    _refuse_types(recording)
+    for name in ("time_s", "odometry", "odometry_cov", "sensor_shift_m", "robot_start", "sensor_start", "start_cov"):
+        _refuse_where(~np.isfinite(getattr(recording, name)), name, recording, "must be finite.")
+
+    is_valid, track_id = np.asarray(recording.is_valid), np.asarray(recording.track_id)
+    _refuse_where(
+        is_valid[..., None] & ~np.isfinite(recording.uv_px), "uv_px", recording, "is marked valid; clear is_valid there."
+    )
+    _refuse_where(is_valid & (track_id < 0), "track_id", recording, "is marked valid; ids start at 0.")
+    _refuse_where(np.diff(recording.time_s, prepend=-np.inf) <= 0, "time_s", recording, "times must grow.")
+    for name in ("odometry_cov", "start_cov"):
+        diagonal = np.diagonal(np.asarray(getattr(recording, name)), axis1=-2, axis2=-1)
+        if np.any(diagonal < 0):
+            raise ValueError(f"Recording({name}): a variance is negative ({diagonal.min()}); variances are at least 0.")
+    for name in ("robot_start", "sensor_start"):
+        norm = float(np.linalg.norm(np.asarray(getattr(recording, name))[3:]))
+        if abs(norm - 1.0) > 1e-3:
+            raise ValueError(f"Recording({name}): the quaternion has length {norm}; divide it by its length.")
+    ordered = np.sort(np.where(is_valid, track_id, -1 - np.arange(track_id.shape[1])), axis=1)
+    repeated = np.argwhere((np.diff(ordered, axis=1) == 0) & (ordered[:, 1:] >= 0))
+    if len(repeated):
+        frame, column = repeated[0]
+        raise ValueError(
+            f"Recording(track_id): frame {frame} has id {ordered[frame, column]} twice; keep one measurement per feature."
+        )
+
+
+def _refuse_types(recording: Recording) -> None:
+    """Refuse ids that are no integers and masks that are no booleans."""
+    if not jnp.issubdtype(recording.track_id.dtype, jnp.integer):
+        raise ValueError(f"Recording(track_id) is {recording.track_id.dtype}; ids are integers.")
+    for name in ("is_valid", "is_last"):
+        if getattr(recording, name).dtype != bool:
+            raise ValueError(f"Recording({name}) is {getattr(recording, name).dtype}; give booleans.")
+
+
+def _refuse_where(is_bad: np.ndarray, name: str, recording: Recording, remedy: str) -> None:
+    """Refuse the first place where `is_bad`, with its index and value."""
+    places = np.argwhere(is_bad)
+    if len(places):
+        place = tuple(int(i) for i in places[0])
+        value = np.asarray(getattr(recording, name))[place]
+        raise ValueError(f"Recording({name}{list(place)} = {value}): {remedy} ({len(places)} such places)")

@@ -1,0 +1,1 @@
+"""Ground truth: worlds, scenarios and simulated recordings. Imports no filter."""
