@@ -1,0 +1,24 @@
+"""vcjax: which image features belong to moving things, and how should a camera move to find out?
+
+A differentiable, batched EKF visual-SLAM library in JAX around the virtual correction (VC) gate. Importing it computes nothing,
+starts no device and leaves JAX's configuration alone; for the paper's numbers switch float64 on first:
+`jax.config.update("jax_enable_x64", True)`.
+"""
+
+from vcjax.filter.config import FilterConfig as FilterConfig
+from vcjax.filter.slam import FrameInfo as FrameInfo
+from vcjax.filter.slam import run as run
+from vcjax.filter.slam import start as start
+from vcjax.filter.slam import step as step
+from vcjax.filter.state import FilterState as FilterState
+from vcjax.gates.inlier_ratio import InlierRatio as InlierRatio
+from vcjax.gates.reprojection import ReprojectionError as ReprojectionError
+from vcjax.gates.virtual_correction import VirtualCorrection as VirtualCorrection
+from vcjax.models.camera import Camera as Camera
+from vcjax.models.motion import Oscillation as Oscillation
+from vcjax.recording import Recording as Recording
+from vcjax.recording import Truth as Truth
+from vcjax.simulation import scenarios as scenarios
+from vcjax.simulation.scenarios import Scenario as Scenario
+from vcjax.simulation.simulate import simulate as simulate
+from vcjax.study.monte_carlo import monte_carlo as monte_carlo

@@ -17,7 +17,7 @@ class Whitener(NamedTuple):
     w21: Float[Array, "..."]
     w22: Float[Array, "..."]
 
-    def __call__(self, a: Float[Array, "2 *n"]) -> Float[Array, "2 *n"]:
+    def __call__(self, a: Float[Array, " 2 *n"]) -> Float[Array, " 2 *n"]:
         """W a, for a vector (2,) or the rows of a matrix (2, n)."""
         return jnp.stack([self.w11 * a[0], self.w21 * a[0] + self.w22 * a[1]])
 

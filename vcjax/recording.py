@@ -14,7 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.fields import is_concrete
 from vcjax.models.camera import Camera
-from vcjax.models.frames import Pose
+
+# A recording may be kept in NumPy; `Recording.frame` hands out JAX arrays.
+AnyArray = Array | np.ndarray
 
 
 class Frame(eqx.Module):
@@ -36,29 +38,29 @@ class Recording(eqx.Module):
     The poses and their covariance are those before the first frame, whose odometry leads from there to the first image.
     """
 
-    time_s: Float[Array, " T"]
+    time_s: Float[AnyArray, " T"]
     """Time of each frame, s."""
-    odometry: Float[Array, "T 6"]
+    odometry: Float[AnyArray, "T 6"]
     """Robot-frame increment since the frame before: Δposition (m), Δrotation vector (rad)."""
-    odometry_cov: Float[Array, "T 6 6"]
+    odometry_cov: Float[AnyArray, "T 6 6"]
     """Covariance of the odometry, per frame."""
-    sensor_shift_m: Float[Array, "T 3"]
+    sensor_shift_m: Float[AnyArray, "T 3"]
     """Commanded displacement of the camera in the robot frame since the frame before, m (the oscillation)."""
-    track_id: Int[Array, "T V"]
+    track_id: Int[AnyArray, "T V"]
     """Identity of each feature; the same number in two frames is the same feature. At least 0 where valid."""
-    uv_px: Float[Array, "T V 2"]
+    uv_px: Float[AnyArray, "T V 2"]
     """Pixel of each feature; anything where not valid."""
-    is_valid: Bool[Array, "T V"]
+    is_valid: Bool[AnyArray, "T V"]
     """Whether the entry holds a measured feature."""
-    is_last: Bool[Array, "T V"]
+    is_last: Bool[AnyArray, "T V"]
     """Whether the feature is never seen again in this recording (see `last_sightings`); all false where nobody knows."""
     camera: Camera
     """Calibration."""
-    robot_start: Pose
+    robot_start: Float[AnyArray, "7"]
     """Robot pose T_w_r before the first frame."""
-    sensor_start: Pose
+    sensor_start: Float[AnyArray, "7"]
     """Sensor pose T_r_s before the first frame (the mount)."""
-    start_cov: Float[Array, "14 14"]
+    start_cov: Float[AnyArray, "14 14"]
     """Covariance of robot and sensor pose before the first frame."""
 
     @property
@@ -85,7 +87,7 @@ class Truth(eqx.Module):
     """Whether a feature moves at any time."""
 
 
-def last_sightings(track_id: Int[Array, "T V"], is_valid: Bool[Array, "T V"]) -> Bool[Array, "T V"]:
+def last_sightings(track_id: Int[AnyArray, "T V"], is_valid: Bool[AnyArray, "T V"]) -> Bool[np.ndarray, "T V"]:
     """Which entries are the last valid one of their track in a recording that is known to its end.
 
     The filter frees a landmark's slot there, so that the map need only hold what is still to be seen.
@@ -111,10 +113,10 @@ def validate(recording: Recording) -> None:
     leaves = jax.tree.leaves(recording)
     if not all(is_concrete(leaf) for leaf in leaves):
         return
-    num_frames = np.shape(recording.time_s)[0] if np.ndim(recording.time_s) == 1 else None
+    num_frames = np.shape(recording.time_s)[0] if np.ndim(recording.time_s) == 1 else "T"
     if num_frames == 0:
         raise ValueError("Recording(time_s=[]): the recording is empty; give at least one frame.")
-    num_features = np.shape(recording.track_id)[-1] if np.ndim(recording.track_id) == 2 else None
+    num_features = np.shape(recording.track_id)[-1] if np.ndim(recording.track_id) == 2 else "V"
     shapes = {
         "time_s": (num_frames,),
         "odometry": (num_frames, 6),
@@ -143,9 +145,8 @@ def validate(recording: Recording) -> None:
     _refuse_where(is_valid & (track_id < 0), "track_id", recording, "is marked valid; ids start at 0.")
     _refuse_where(np.diff(recording.time_s, prepend=-np.inf) <= 0, "time_s", recording, "times must grow.")
     for name in ("odometry_cov", "start_cov"):
-        diagonal = np.diagonal(np.asarray(getattr(recording, name)), axis1=-2, axis2=-1)
-        if np.any(diagonal < 0):
-            raise ValueError(f"Recording({name}): a variance is negative ({diagonal.min()}); variances are at least 0.")
+        cov = np.asarray(getattr(recording, name))
+        _refuse_where((cov < 0) & np.eye(cov.shape[-1], dtype=bool), name, recording, "variances are at least 0.")
     for name in ("robot_start", "sensor_start"):
         norm = float(np.linalg.norm(np.asarray(getattr(recording, name))[3:]))
         if abs(norm - 1.0) > 1e-3:

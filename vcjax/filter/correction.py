@@ -9,9 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.ekf import mahalanobis, whitener
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.features import measurement_model, observe, retract
-from vcjax.filter.state import SLOT, VEHICLE, slot_rows
-from vcjax.filter.submap import Submap, block, block_cov
+from vcjax.filter.features import measurement_model, observe
+from vcjax.filter.state import SLOT, VEHICLE
+from vcjax.filter.submap import Submap, block, block_cov, slot_rows
 from vcjax.gates.gate import Candidates, Verdict
 from vcjax.models.camera import Camera
 from vcjax.models.frames import unit

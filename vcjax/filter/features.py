@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.state import SLOT, VEHICLE, FilterState
+from vcjax.filter.state import SLOT, VEHICLE, FilterState, slot_blocks
 from vcjax.gates.gate import MeasurementModel
 from vcjax.models.camera import Camera, is_inside
 from vcjax.models.frames import unit, unit_jacobian
@@ -92,12 +92,10 @@ def predict_features(config: FilterConfig, state: FilterState, camera: Camera) -
     observation = jax.vmap(lambda block: observe(config, camera, block))(blocks)
 
     H_v, H_l = observation.H[..., :VEHICLE], observation.H[..., VEHICLE:]
-    P_vl = state.P[:VEHICLE, VEHICLE:].reshape(VEHICLE, num_slots, SLOT)
-    P_ll = state.P[VEHICLE:, VEHICLE:].reshape(num_slots, SLOT, num_slots, SLOT)
-    P_ll = P_ll[jnp.arange(num_slots), :, jnp.arange(num_slots), :]
+    P_vl = state.P_vm.reshape(VEHICLE, num_slots, SLOT)
     cross = jnp.einsum("lav,vlj,lbj->lab", H_v, P_vl, H_l)
-    E = jnp.einsum("lav,vw,lbw->lab", H_v, state.P[:VEHICLE, :VEHICLE], H_v)
-    E = E + cross + cross.mT + jnp.einsum("lai,lij,lbj->lab", H_l, P_ll, H_l)
+    E = jnp.einsum("lav,vw,lbw->lab", H_v, state.P_vv, H_v)
+    E = E + cross + cross.mT + jnp.einsum("lai,lij,lbj->lab", H_l, slot_blocks(state), H_l)
     uncertainty = E[:, 0, 0] * E[:, 1, 1] - E[:, 0, 1] * E[:, 1, 0]
     return Prediction(is_mapped & observation.is_visible, uncertainty)
 

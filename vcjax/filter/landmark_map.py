@@ -3,10 +3,10 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.state import FREE, SLOT, VEHICLE, FilterState, slot_rows
+from vcjax.filter.state import FREE, SLOT, FilterState
 from vcjax.models.camera import is_inside
 from vcjax.models.landmarks import INVERSE_DEPTH, back_project_landmark
 from vcjax.recording import Frame
@@ -57,15 +57,16 @@ def give_birth(
     def attempt(carry, _):
         state, is_eligible = carry
         column = jnp.argmin(jnp.where(is_eligible, rank, last))
-        is_free = ~state.is_mapped
-        slot = jnp.argmax(is_free)
-        is_born = is_eligible[column] & is_free[slot]
+        # Where nothing can be born, the spare slot takes the write: it is the last, and always free.
+        spare = state.track_id.shape[0] - 1
+        slot = jnp.where(is_eligible[column], jnp.argmin(state.is_mapped), spare)
+        is_born = slot != spare
         born_id = jnp.where(is_born, frame.track_id[column], FREE)
-        state = _initialise(config, state, frame, column, slot, is_born)
+        state = _initialise(config, state, frame, column, slot, born_id)
         return (state, is_eligible.at[column].set(is_eligible[column] & ~is_born)), born_id
 
     (state, is_waiting), born = jax.lax.scan(attempt, (state, is_eligible), None, length=num_births)
-    return state, born, jnp.any(is_waiting) & jnp.all(state.is_mapped)
+    return state, born, jnp.any(is_waiting) & jnp.all(state.is_mapped[:-1])
 
 
 def _initialise(
@@ -74,13 +75,13 @@ def _initialise(
     frame: Frame,
     column: Int[Array, ""],
     slot: Int[Array, ""],
-    is_born: Bool[Array, ""],
+    born_id: Int[Array, ""],
 ) -> FilterState:
-    """Write a new AHP landmark l(vehicle, pixel, ρ) into a slot; nothing where it is not born.
+    """Write a new AHP landmark l(vehicle, pixel, ρ) into a slot.
 
     P_lX = L_m P_mX and P_ll = L_m P_mm L_mᵀ + L_y R L_yᵀ + σ_ρ² L_ρ L_ρᵀ with m the vehicle (robot and sensor).
     """
-    uv_px = jnp.where(is_born, frame.uv_px[column], 0.0)
+    uv_px = jnp.where(born_id != FREE, frame.uv_px[column], 0.0)
 
     def back_project(vehicle, pixel):
         return back_project_landmark(
@@ -89,30 +90,25 @@ def _initialise(
 
     landmark = back_project(state.vehicle, uv_px)
     L_m, L_y = jax.jacfwd(back_project, argnums=(0, 1))(state.vehicle, uv_px)
-    variance = config.pixel_std_px**2 * (L_y @ L_y.T)
-    variance = variance.at[INVERSE_DEPTH, INVERSE_DEPTH].add(config.inverse_depth_std**2)
+    own = L_m @ state.P_vv @ L_m.T + config.pixel_std_px**2 * (L_y @ L_y.T)
+    own = own.at[INVERSE_DEPTH, INVERSE_DEPTH].add(config.inverse_depth_std**2)
 
-    first = slot_rows(slot)
-    rows = L_m @ state.P[:VEHICLE]
-    own = rows[:, :VEHICLE] @ L_m.T + variance
-    rows = jax.lax.dynamic_update_slice_in_dim(rows, own, first, axis=1)
-    rows = jnp.where(is_born, rows, jax.lax.dynamic_slice_in_dim(state.P, first, SLOT))
-    P = jax.lax.dynamic_update_slice_in_dim(state.P, rows, first, axis=0)
-    P = jax.lax.dynamic_update_slice_in_dim(P, rows.T, first, axis=1)
-
-    def write(field: Array, value: Array) -> Array:
-        return field.at[slot].set(jnp.where(is_born, value, field[slot]))
-
+    first = SLOT * slot
+    rows = jax.lax.dynamic_update_slice_in_dim(L_m @ state.P_vm, own, first, axis=1)
+    P_vm = jax.lax.dynamic_update_slice_in_dim(state.P_vm, state.P_vv @ L_m.T, first, axis=1)
+    P_mm = jax.lax.dynamic_update_slice_in_dim(state.P_mm, rows, first, axis=0)
+    P_mm = jax.lax.dynamic_update_slice_in_dim(P_mm, rows.T, first, axis=1)
     return eqx.tree_at(
-        lambda s: (s.landmarks, s.to_coordinates, s.P, s.track_id, s.is_euclidean, s.detector),
+        lambda s: (s.landmarks, s.to_coordinates, s.P_vm, s.P_mm, s.track_id, s.is_euclidean, s.detector),
         state,
         (
-            write(state.landmarks, landmark),
-            write(state.to_coordinates, jnp.eye(SLOT, dtype=P.dtype)),
-            P,
-            write(state.track_id, frame.track_id[column].astype(state.track_id.dtype)),
-            write(state.is_euclidean, jnp.zeros((), bool)),
-            jax.tree.map(write, state.detector, config.detector.born()),
+            state.landmarks.at[slot].set(landmark),
+            state.to_coordinates.at[slot].set(jnp.eye(SLOT, dtype=P_mm.dtype)),
+            P_vm,
+            P_mm,
+            state.track_id.at[slot].set(born_id.astype(state.track_id.dtype)),
+            state.is_euclidean.at[slot].set(False),
+            jax.tree.map(lambda field, value: field.at[slot].set(value), state.detector, config.detector.born()),
         ),
     )
 

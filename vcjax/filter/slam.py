@@ -15,7 +15,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import choose, match, predict_features
 from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state
-from vcjax.filter.submap import gather, normalise, scatter
+from vcjax.filter.submap import gather, scatter
 from vcjax.gates.gate import Evidence
 from vcjax.models.motion import move_by_odometry
 from vcjax.recording import Frame, Recording, validate
@@ -54,8 +54,8 @@ class FrameInfo(eqx.Module):
     """Features deleted by the detector; -1 elsewhere."""
     born_id: Int[Array, " births"]
     """Features initialised; -1 for an attempt without a birth."""
-    num_landmarks: Int[Array, ""]
-    """Landmarks in the map at the end of the frame."""
+    track_id: Int[Array, " L"]
+    """Feature held by each slot at the end of the frame, before retirement; -1 where free."""
     map_is_full: Bool[Array, ""]
     """Whether a feature waits for a free slot."""
     is_finite: Bool[Array, ""]
@@ -65,17 +65,18 @@ class FrameInfo(eqx.Module):
 def predict(config: FilterConfig, state: FilterState, frame: Frame) -> FilterState:
     """Prediction: the robot moves by the odometry, the camera by its commanded displacement. Equations (6) and (7).
 
-    Only the robot's rows and columns of P change: P_r,all ← F P_r,all, P_rr += F_n N F_nᵀ.
+    Only the robot's rows of P change: P_r,all ← F P_r,all, P_rr += F_n N F_nᵀ.
     """
     robot = state.robot
     F, F_n = jax.jacfwd(move_by_odometry, argnums=(0, 1))(robot, frame.odometry)
     sensor = state.sensor.at[:3].add(frame.sensor_shift_m)
-    P = state.P.at[:7].set(F @ state.P[:7])
-    P = P.at[:, :7].set(P[:, :7] @ F.T)
-    P = P.at[:7, :7].add(F_n @ frame.odometry_cov @ F_n.T)
-    P = P.at[8, 8].add(config.oscillation_std_m**2)  # the lateral axis, y, of the sensor's position
+    F_v = jnp.eye(VEHICLE, dtype=F.dtype).at[:7, :7].set(F)
+    P_vv = F_v @ state.P_vv @ F_v.T
+    P_vv = P_vv.at[:7, :7].add(F_n @ frame.odometry_cov @ F_n.T)
+    P_vv = P_vv.at[8, 8].add(config.oscillation_std_m**2)  # the lateral axis, y, of the sensor's position
+    P_vm = state.P_vm.at[:7].set(F @ state.P_vm[:7])
     vehicle = jnp.concatenate([move_by_odometry(robot, frame.odometry), sensor])
-    return eqx.tree_at(lambda s: (s.vehicle, s.P), state, (vehicle, P))
+    return eqx.tree_at(lambda s: (s.vehicle, s.P_vv, s.P_vm), state, (vehicle, P_vv, P_vm))
 
 
 def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[FilterState, FrameInfo]:
@@ -100,7 +101,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
 
     submap, rows = gather(state, slot)
     submap, outcome = correct_frame(config, frame.camera, submap, uv_px, is_measured)
-    state = normalise(config, scatter(state, submap, slot, rows))
+    state = scatter(config, state, submap, slot, rows)
     innovation, verdict = outcome.innovation, outcome.verdict
 
     is_dynamic = jnp.zeros_like(prediction.is_visible).at[slot].set(verdict.is_dynamic)
@@ -153,8 +154,8 @@ def start(
     """
     state = initial_state(config, recording, key)
     frame = recording.frame(0)
-    state = normalise(config, predict(config, state, frame))
-    K, dtype = config.max_updates, state.P.dtype
+    state = predict(config, state, frame)
+    K, dtype = config.max_updates, state.P_vv.dtype
     nobody, nothing = jnp.zeros(K, bool), jnp.full(K, jnp.nan, dtype)
     info_of_candidates = dict(
         candidate_id=jnp.full(K, FREE, jnp.int32),
@@ -168,7 +169,7 @@ def start(
         is_accepted=nobody,
         is_recovered=nobody,
         is_dynamic=nobody,
-        inconsistent_id=jnp.full(config.max_landmarks, FREE, jnp.int32),
+        inconsistent_id=jnp.full(config.max_landmarks + 1, FREE, jnp.int32),
     )
     is_mapped = jnp.zeros_like(frame.is_valid)
     return _finish(config, state, frame, is_mapped, config.births_first_frame, info_of_candidates)
@@ -185,16 +186,16 @@ def _finish(
     """Births and retirement, and the frame's info."""
     state, born, is_full = landmark_map.give_birth(config, state, frame, is_mapped, num_births)
     attempts = max(config.births_first_frame, config.births_per_frame)
-    num_landmarks = jnp.sum(state.is_mapped)
+    track_id = state.track_id
     if config.retire:
         is_last = match(state, frame.track_id, frame.is_valid & frame.is_last)
         state = landmark_map.delete(state, jnp.any(is_last, axis=1))
-    vehicle_cov = state.P[:VEHICLE, :VEHICLE]
+    vehicle_cov = state.P_vv
     info = FrameInfo(
         vehicle=state.vehicle,
         vehicle_cov=vehicle_cov,
         born_id=jnp.full(attempts, FREE, born.dtype).at[:num_births].set(born),
-        num_landmarks=num_landmarks,
+        track_id=track_id,
         map_is_full=is_full,
         is_finite=jnp.all(jnp.isfinite(state.vehicle)) & jnp.all(jnp.isfinite(vehicle_cov)),
         **info_of_candidates,

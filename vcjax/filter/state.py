@@ -1,7 +1,8 @@
 """FilterState: what the next frame needs, and nothing else.
 
-The map has a fixed number L of slots of seven error coordinates each, so x and P have N = 14 + 7 L rows whatever the map
-holds: robot 7, sensor 7, then the slots (paper equations 2 and 3).
+The map has a fixed number L of slots of seven error coordinates each, whatever it holds. P is kept as the three blocks of
+paper equation (3): vehicle (robot and sensor) with itself, vehicle with slots, slots with slots. Prediction, the
+normalisation of quaternions and much of a correction touch the first two only, which are small.
 
 A slot keeps the seven AHP error coordinates it was born with for life. When its landmark becomes Euclidean, p = f(x_AHP),
 only the mean changes its form; P keeps its seven rows and `to_coordinates` keeps J = ∂f/∂x_AHP, frozen at that moment. As
@@ -9,7 +10,8 @@ Kalman updates are linear in the error, using H J with the old rows gives, ever 
 transformed by J would give, and no pass over P is needed.
 
 A free slot's rows hold whatever they held before: the numbers of a landmark that is never looked at again. They are as
-inert as zeros would be, and cost nothing to leave.
+inert as zeros would be, and cost nothing to leave. The last slot is a spare: always free, it takes the writes of births
+that do not happen, so that no branch and no copy of P is needed. Hence L = max_landmarks + 1.
 """
 
 import equinox as eqx
@@ -18,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vcjax.filter.config import FilterConfig
+from vcjax.models.frames import unit
 from vcjax.recording import Recording
 
 VEHICLE = 14
@@ -37,8 +40,12 @@ class FilterState(eqx.Module):
     """Landmark means, AHP or Euclidean in the common form (see `models.landmarks`)."""
     to_coordinates: Float[Array, "L 7 7"]
     """Derivative of a landmark's coordinates by its slot's error coordinates: I for AHP, [J; 0] for Euclidean."""
-    P: Float[Array, "N N"]
-    """Covariance of vehicle and slots' error coordinates."""
+    P_vv: Float[Array, "14 14"]
+    """Covariance of the vehicle, [P_rr P_rs; P_sr P_ss]."""
+    P_vm: Float[Array, "14 M"]
+    """Covariance of vehicle with slots' error coordinates, M = 7 L; [P_rm; P_sm]."""
+    P_mm: Float[Array, "M M"]
+    """Covariance of slots' error coordinates."""
     track_id: Int[Array, " L"]
     """Which feature a slot holds; -1 where it is free."""
     is_euclidean: Bool[Array, " L"]
@@ -77,16 +84,18 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
             f"initial_state(key={key}): give a key if and only if births are in random order "
             f"(FilterConfig(birth_order={config.birth_order!r}))."
         )
-    num_slots = config.max_landmarks
-    vehicle = jnp.concatenate([recording.robot_start, recording.sensor_start])
+    num_slots = config.max_landmarks + 1
+    poses = (jnp.asarray(recording.robot_start), jnp.asarray(recording.sensor_start))
+    vehicle = jnp.concatenate([part for pose in poses for part in (pose[:3], unit(pose[3:]))])
     dtype = vehicle.dtype
-    size = VEHICLE + SLOT * num_slots
-    P = jnp.zeros((size, size), dtype).at[:VEHICLE, :VEHICLE].set(recording.start_cov.astype(dtype))
+    size = SLOT * num_slots
     return FilterState(
         vehicle=vehicle,
         landmarks=jnp.broadcast_to(jnp.array([0, 0, 0, 1, 0, 0, 1], dtype), (num_slots, SLOT)),
         to_coordinates=jnp.broadcast_to(jnp.eye(SLOT, dtype=dtype), (num_slots, SLOT, SLOT)),
-        P=P,
+        P_vv=jnp.asarray(recording.start_cov, dtype),
+        P_vm=jnp.zeros((VEHICLE, size), dtype),
+        P_mm=jnp.zeros((size, size), dtype),
         track_id=jnp.full(num_slots, FREE, jnp.int32),
         is_euclidean=jnp.zeros(num_slots, bool),
         detector=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_slots, *leaf.shape)), config.detector.born()),
@@ -95,15 +104,24 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
     )
 
 
-def slot_rows(slot: int | Int[Array, ""]) -> Int[Array, ""] | int:
-    """First row of a slot in P."""
-    return VEHICLE + SLOT * slot
+def slot_blocks(state: FilterState) -> Float[Array, "L 7 7"]:
+    """Covariance of each slot's own error coordinates, the diagonal blocks of P_mm."""
+    num_slots = state.track_id.shape[0]
+    blocks = state.P_mm.reshape(num_slots, SLOT, num_slots, SLOT)
+    return blocks[jnp.arange(num_slots), :, jnp.arange(num_slots), :]
 
 
 def landmark_cov(state: FilterState) -> Float[Array, "L 7 7"]:
     """Covariance of each landmark's coordinates (the last four rows and columns are zero where Euclidean)."""
-    num_slots = state.track_id.shape[0]
-    blocks = state.P[VEHICLE:, VEHICLE:].reshape(num_slots, SLOT, num_slots, SLOT)
-    diagonal = blocks[jnp.arange(num_slots), :, jnp.arange(num_slots), :]
     T = state.to_coordinates
-    return T @ diagonal @ T.mT
+    return T @ slot_blocks(state) @ T.mT
+
+
+def full_cov(state: FilterState) -> Float[Array, "N N"]:
+    """P whole: vehicle, then the coordinates of every slot. Free slots are zero. Paper equation (3)."""
+    num_slots = state.track_id.shape[0]
+    T = jnp.where(state.is_mapped[:, None, None], state.to_coordinates, 0.0)
+    P_vm = jnp.einsum("vlj,lij->vli", state.P_vm.reshape(VEHICLE, num_slots, SLOT), T).reshape(VEHICLE, -1)
+    P_mm = jnp.einsum("lij,ljmk,mnk->limn", T, state.P_mm.reshape(num_slots, SLOT, num_slots, SLOT), T)
+    size = num_slots * SLOT
+    return jnp.block([[state.P_vv, P_vm], [P_vm.T, P_mm.reshape(size, size)]])

@@ -22,8 +22,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.features import Block
-from vcjax.filter.state import SLOT, VEHICLE, FilterState, slot_rows
+from vcjax.filter.state import SLOT, VEHICLE, FilterState
 from vcjax.models.frames import unit, unit_jacobian
+
+
+def slot_rows(j: int | Int[Array, ""]) -> int | Int[Array, ""]:
+    """First row of candidate j in the submap."""
+    return VEHICLE + SLOT * j
 
 
 class Submap(eqx.Module):
@@ -53,13 +58,13 @@ def block_cov(submap: Submap, j: int | Int[Array, ""]) -> Float[Array, "21 21"]:
     return jnp.concatenate([rows[:, :VEHICLE], jax.lax.dynamic_slice_in_dim(rows, slot_rows(j), SLOT, axis=1)], axis=1)
 
 
-def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Array, "n N"]]:
-    """The submap of the chosen slots, and the rows of P that it stands in."""
+def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Array, "n M"]]:
+    """The submap of the chosen slots, and its covariance with all slots, P⁰[submap, slots]."""
     num_slots, num_chosen = state.track_id.shape[0], slot.shape[0]
-    slot_part = state.P[VEHICLE:].reshape(num_slots, SLOT, -1)[slot].reshape(num_chosen * SLOT, -1)
-    rows = jnp.concatenate([state.P[:VEHICLE], slot_part])
-    columns = rows[:, VEHICLE:].reshape(-1, num_slots, SLOT)[:, slot].reshape(-1, num_chosen * SLOT)
-    P = jnp.concatenate([rows[:, :VEHICLE], columns], axis=1)
+    chosen = state.P_mm.reshape(num_slots, SLOT, -1)[slot].reshape(num_chosen * SLOT, -1)
+    rows = jnp.concatenate([state.P_vm, chosen])
+    columns = rows.reshape(-1, num_slots, SLOT)[:, slot].reshape(-1, num_chosen * SLOT)
+    P = jnp.concatenate([jnp.concatenate([state.P_vv, columns[:VEHICLE].T]), columns], axis=1)
     empty = jnp.zeros((2 * num_chosen, P.shape[0]), P.dtype)
     submap = Submap(
         vehicle=state.vehicle,
@@ -75,35 +80,37 @@ def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Ar
 
 
 def scatter(
-    state: FilterState, submap: Submap, slot: Int[Array, " K"], rows: Float[Array, "n N"]
+    config: FilterConfig, state: FilterState, submap: Submap, slot: Int[Array, " K"], rows: Float[Array, "n M"]
 ) -> FilterState:
     """The state after the frame's corrections, from the submap and the rows it was gathered with.
 
-    The rest of the state follows by U = C P⁰[submap, :].
+    The rest of the state follows by U = C P⁰[submap, :]. Then both quaternions are brought to unit length, q/|q|, and
+    P ← N P Nᵀ with N the derivative of that.
     """
     U = submap.C @ rows
-    shift = (U.T @ submap.w)[VEHICLE:].reshape(-1, SLOT)
+    shift = (U.T @ submap.w).reshape(-1, SLOT)
     landmarks = state.landmarks + jnp.einsum("lij,lj->li", state.to_coordinates, shift)
+    vehicle, N = normalise(config, submap.vehicle)
     return eqx.tree_at(
-        lambda s: (s.vehicle, s.landmarks, s.to_coordinates, s.is_euclidean, s.P),
+        lambda s: (s.vehicle, s.landmarks, s.to_coordinates, s.is_euclidean, s.P_vv, s.P_vm, s.P_mm),
         state,
         (
-            submap.vehicle,
+            vehicle,
             landmarks.at[slot].set(submap.landmarks),
             state.to_coordinates.at[slot].set(submap.to_coordinates),
             state.is_euclidean.at[slot].set(submap.is_euclidean),
-            state.P - U.T @ U,
+            N @ submap.P[:VEHICLE, :VEHICLE] @ N.T,
+            N @ (state.P_vm - submap.U[:, :VEHICLE].T @ U),
+            state.P_mm - U.T @ U,
         ),
     )
 
 
-def normalise(config: FilterConfig, state: FilterState) -> FilterState:
-    """Bring both quaternions to unit length: q/|q|, and P ← M P Mᵀ with M the derivative of that."""
-    M = jnp.eye(VEHICLE, dtype=state.P.dtype)
-    vehicle = state.vehicle
+def normalise(config: FilterConfig, vehicle: Float[Array, "14"]) -> tuple[Float[Array, "14"], Float[Array, "14 14"]]:
+    """The vehicle with both quaternions of unit length, and the derivative of that."""
+    N = jnp.eye(VEHICLE, dtype=vehicle.dtype)
+    unit_vehicle = vehicle
     for q in (slice(3, 7), slice(10, 14)):
-        M = M.at[q, q].set(unit_jacobian(state.vehicle[q], config.toolbox_parity))
-        vehicle = vehicle.at[q].set(unit(state.vehicle[q], config.toolbox_parity))
-    P = state.P.at[:VEHICLE].set(M @ state.P[:VEHICLE])
-    P = P.at[:, :VEHICLE].set(P[:, :VEHICLE] @ M.T)
-    return eqx.tree_at(lambda s: (s.vehicle, s.P), state, (vehicle, P))
+        unit_vehicle = unit_vehicle.at[q].set(unit(vehicle[q], config.toolbox_parity))
+        N = N.at[q, q].set(unit_jacobian(vehicle[q], config.toolbox_parity))
+    return unit_vehicle, N

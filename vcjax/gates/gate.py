@@ -13,6 +13,8 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 Prior = Literal["corrected", "predicted"]
@@ -40,6 +42,28 @@ class Candidates(eqx.Module):
     """Pixel noise covariance W, px²."""
     is_isolated: Bool[Array, " K"]
     """Measured but not accepted: the candidates to judge. The others' numbers mean nothing."""
+
+
+def harmless(candidates: Candidates) -> Candidates:
+    """The candidates, with those that are not to be judged replaced by numbers without effect: mean 1, P 0, pixel 0.
+
+    A masked candidate may hold anything, NaN included. Replaced before anything is computed, it leaves the derivatives by what
+    all candidates share finite. The mean is of ones because zeros are neither a quaternion nor a depth.
+    """
+
+    def replace(leaf, number):
+        is_isolated = candidates.is_isolated.reshape(-1, *(1,) * (leaf.ndim - 1))
+        return jnp.where(is_isolated, leaf, jnp.asarray(number, leaf.dtype))
+
+    return eqx.tree_at(
+        lambda c: (c.mean, c.P, c.uv_px),
+        candidates,
+        (
+            jax.tree.map(lambda leaf: replace(leaf, 1), candidates.mean),
+            replace(candidates.P, 0),
+            replace(candidates.uv_px, 0),
+        ),
+    )
 
 
 class Verdict(eqx.Module):

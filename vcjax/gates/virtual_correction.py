@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from vcjax.ekf import correct, innovation_cov, mahalanobis
 from vcjax.fields import number, require
-from vcjax.gates.gate import AbstractGate, Candidates, MeasurementModel, Prior, Verdict
+from vcjax.gates.gate import AbstractGate, Candidates, MeasurementModel, Prior, Verdict, harmless
 from vcjax.gates.reprojection import check_prior
 
 
@@ -54,8 +54,8 @@ class VirtualCorrection(AbstractGate):
         def errors(mean, P, uv_px):
             return virtual_correction(model, mean, P, uv_px, candidates.R)
 
+        is_isolated, candidates = candidates.is_isolated, harmless(candidates)
         re1, re2 = jax.vmap(errors)(candidates.mean, candidates.P, candidates.uv_px)
-        is_isolated = candidates.is_isolated
         is_dynamic = is_isolated & (re1 - re2 > self.th2)
         return Verdict(
             is_recovered=is_isolated & ~is_dynamic,

@@ -21,19 +21,17 @@ UNDISTORTION_STEPS = 8
 class Camera(eqx.Module):
     """Image size and intrinsic calibration. Default: the camera of the paper's Table 1."""
 
-    intrinsics_px: tuple[float, float, float, float] = eqx.field(
-        converter=vector(4), default=(320.0, 240.0, 320.0, 320.0)
-    )
+    intrinsics_px: tuple[float, float, float, float] = eqx.field(converter=vector, default=(320.0, 240.0, 320.0, 320.0))
     """[u0, v0, αu, αv]: principal point and focal lengths, px."""
-    image_size_px: tuple[float, float] = eqx.field(converter=vector(2), default=(640.0, 480.0))
+    image_size_px: tuple[float, float] = eqx.field(converter=vector, default=(640.0, 480.0))
     """Width and height, px."""
-    distortion: tuple[float, ...] = eqx.field(converter=vector(), default=())
+    distortion: tuple[float, ...] = eqx.field(converter=vector, default=())
     """Radial distortion coefficients d1, d2, …; none by default."""
 
     def __check_init__(self):
-        require(self, "intrinsics_px", np.isfinite, "give finite u0 v0 au av in pixels.")
+        require(self, "intrinsics_px", np.isfinite, "give finite u0 v0 au av in pixels.", length=4)
         require(self, "intrinsics_px", lambda k: k[..., 2:] > 0, "focal lengths au av (the last two) must be positive.")
-        require(self, "image_size_px", lambda size: size > 0, "give a positive width and height in pixels.")
+        require(self, "image_size_px", lambda size: size > 0, "give a positive width and height in pixels.", length=2)
         require(self, "distortion", np.isfinite, "give finite coefficients, or none.")
 
 

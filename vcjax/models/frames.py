@@ -62,7 +62,7 @@ def rotate_back_jacobian(q: Quaternion, v: Vector3) -> Float[Array, "3 4"]:
 
 
 def quaternion_product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """p ⊗ q: first rotate by q, then by p."""
+    """P ⊗ q: first rotate by q, then by p."""
     pw, px, py, pz = p
     qw, qx, qy, qz = q
     return jnp.stack(
@@ -97,7 +97,7 @@ def rotation_vector_from_quaternion(q: Quaternion) -> Vector3:
     sine2 = jnp.sum(q[1:] * q[1:])
     is_small = sine2 < (SMALL_ANGLE_RAD / 2.0) ** 2
     sine = jnp.sqrt(jnp.where(is_small, 1.0, sine2))
-    scale = jnp.where(is_small, 2.0 / q[0], 2.0 * jnp.arctan2(sine, q[0]) / sine)
+    scale = jnp.where(is_small, 2.0 / jnp.where(is_small, q[0], 1.0), 2.0 * jnp.arctan2(sine, q[0]) / sine)
     return scale * q[1:]
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from vcjax.fields import is_concrete, number, require, vector
+from vcjax.fields import is_concrete, number, require, require_count, vector
 from vcjax.models.camera import Camera
 from vcjax.models.motion import Oscillation
 from vcjax.simulation.world import Movers, grid
@@ -33,7 +33,7 @@ ROBOT_MOTIONS = {
 class Scenario(eqx.Module):
     """A simulated experiment: robot, camera, oscillation, features, movers and noise."""
 
-    landmarks_m: Float[Array, "F 3"]
+    landmarks_m: Float[Array | np.ndarray, "F 3"]
     """Features at time 0, m. A feature's number is its track id."""
     movers: Movers
     """Which of them move, and how."""
@@ -41,13 +41,13 @@ class Scenario(eqx.Module):
     """The camera's sideways motion."""
     camera: Camera = eqx.field(default_factory=Camera)
     """Calibration."""
-    start: tuple[float, float, float] = eqx.field(converter=vector(3), default=(-8.0, 0.0, 0.0))
+    start: tuple[float, float, float] = eqx.field(converter=vector, default=(-8.0, 0.0, 0.0))
     """Robot's x, y (m) and yaw (deg) before the first frame; its height is 0."""
-    increment: tuple[float, float, float] = eqx.field(converter=vector(3), default=(0.05, 0.0, 0.0))
+    increment: tuple[float, float, float] = eqx.field(converter=vector, default=(0.05, 0.0, 0.0))
     """True motion per frame in the robot frame: x, y (m) and yaw (deg)."""
-    mount: tuple[float, ...] = eqx.field(converter=vector(6), default=(0.0, 0.0, 0.6, -90.0, 0.0, -90.0))
+    mount: tuple[float, ...] = eqx.field(converter=vector, default=(0.0, 0.0, 0.6, -90.0, 0.0, -90.0))
     """Camera in the robot frame: x, y, z (m), roll, pitch, yaw (deg)."""
-    odometry_std: tuple[float, ...] = eqx.field(converter=vector(6), default=(0.005, 0.005, 0.0, 0.0, 0.0, 0.05))
+    odometry_std: tuple[float, ...] = eqx.field(converter=vector, default=(0.005, 0.005, 0.0, 0.0, 0.0, 0.05))
     """Noise of the odometry per frame: x, y, z (m), rotation about x, y, z (deg). Default: planar, Table 1."""
     pixel_std_px: float = eqx.field(converter=number, default=1.0)
     """Noise of a measured pixel, px."""
@@ -61,12 +61,12 @@ class Scenario(eqx.Module):
         if len(shape) < 2 or shape[-1] != 3 or shape[-2] == 0:
             raise ValueError(f"Scenario(landmarks_m) has shape {shape}; give at least one feature, (F, 3) m.")
         require(self, "landmarks_m", np.isfinite, "features need finite places.")
-        for name in ("start", "increment", "mount"):
-            require(self, name, np.isfinite, "give finite numbers.")
-        require(self, "odometry_std", lambda s: np.isfinite(s) & (s >= 0), "standard deviations are at least 0.")
+        for name, length in (("start", 3), ("increment", 3), ("mount", 6)):
+            require(self, name, np.isfinite, "give finite numbers.", length)
+        require(self, "odometry_std", lambda s: np.isfinite(s) & (s >= 0), "standard deviations are at least 0.", 6)
         require(self, "pixel_std_px", lambda s: np.isfinite(s) & (s >= 0), "a standard deviation is at least 0.")
         require(self, "frame_rate_hz", lambda r: np.isfinite(r) & (r > 0), "give a positive rate.")
-        require(self, "num_frames", lambda n: n >= 1, "a run has at least one frame.")
+        require_count(self, "num_frames", 1)
         ids, num_features = self.movers.ids, shape[-2]
         if is_concrete(ids) and np.size(ids) and (np.min(ids) < 0 or np.max(ids) >= num_features):
             raise ValueError(
@@ -83,13 +83,13 @@ class Scenario(eqx.Module):
 def paper(
     robot: RobotMotion = "forward",
     dynamic: DynamicMotion | None = None,
-    dynamic_speed_m_s: float | Array = 1.0,
+    dynamic_speed_m_s: float = 1.0,
     dynamic_set: DynamicSet | Sequence[int] = "ahead",
-    oscillation_amplitude_m: float | Array = 0.0,
-    oscillation_frequency_hz: float | Array = 3.0,
+    oscillation_amplitude_m: float = 0.0,
+    oscillation_frequency_hz: float = 3.0,
     noise: Literal["planar", "six_axis"] = "planar",
     step_m: float = 0.05,
-    pixel_std_px: float | Array = 1.0,
+    pixel_error_std_px: float = 1.0,
     frame_rate_hz: float = 10.0,
     num_frames: int = 160,
 ) -> Scenario:
@@ -105,7 +105,7 @@ def paper(
         oscillation_frequency_hz: f of equation (1), Hz, below half the frame rate.
         noise: odometry noise of Table 1 in the plane (x, y, yaw) or on all six axes.
         step_m: length of the robot's step per frame, m.
-        pixel_std_px: noise of a measured pixel, px.
+        pixel_error_std_px: noise of a measured pixel, px (the filter assumes its own).
         frame_rate_hz: frames per second.
         num_frames: frames in a run.
 
@@ -133,7 +133,7 @@ def paper(
         start=start,
         increment=(step_m * direction[0], step_m * direction[1], direction[2]),
         odometry_std=odometry_std,
-        pixel_std_px=pixel_std_px,
+        pixel_std_px=pixel_error_std_px,
         frame_rate_hz=frame_rate_hz,
         num_frames=num_frames,
     )
@@ -142,7 +142,10 @@ def paper(
 def _dynamic_ids(dynamic_set: DynamicSet | Sequence[int], landmarks: Float[np.ndarray, "F 3"]) -> np.ndarray:
     """Feature ids of a preset, or the ids given."""
     if not isinstance(dynamic_set, str):
-        return np.asarray(dynamic_set, np.int32)
+        ids = np.asarray(dynamic_set)
+        if ids.size and not np.issubdtype(ids.dtype, np.integer):
+            raise ValueError(f"paper(dynamic_set={dynamic_set!r}): feature ids are whole numbers.")
+        return ids.astype(np.int32)
     if dynamic_set not in DYNAMIC_POINTS_M:
         raise ValueError(
             f"paper(dynamic_set={dynamic_set!r}): choose one of {tuple(DYNAMIC_POINTS_M)}, or give feature ids."

@@ -23,15 +23,15 @@ def grid(
 class Movers(eqx.Module):
     """Features that move with one constant velocity from the first frame on."""
 
-    ids: Int[Array, " D"]
+    ids: Int[Array | np.ndarray, " D"]
     """Which features."""
-    direction: tuple[float, float, float] = eqx.field(converter=vector(3), default=(0.0, 1.0, 0.0))
+    direction: tuple[float, float, float] = eqx.field(converter=vector, default=(0.0, 1.0, 0.0))
     """Direction of motion in the world; scaled by the speed, so of unit length."""
     speed_m_s: float = eqx.field(converter=number, default=0.0)
     """Speed, m/s; 0: they stand still and count as static."""
 
     def __check_init__(self):
-        require(self, "direction", np.isfinite, "give finite numbers.")
+        require(self, "direction", np.isfinite, "give finite numbers.", length=3)
         require(self, "speed_m_s", lambda v: np.isfinite(v) & (v >= 0), "a speed is at least 0; turn the direction round.")
 
 

@@ -1,0 +1,26 @@
+"""Set-up of all tests: float64, shapes and types of the package checked at run time, golden numbers at hand."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import hypothesis
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_enable_x64", True)
+
+# Checks every call of the package against its annotations; while tracing, so that compiled code pays nothing. It must be
+# set up before the package is imported anywhere.
+install_import_hook("vcjax", "beartype.beartype")
+
+# The same examples in every run. Their time is mostly compilation, which the first of them pays: no deadline.
+hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=60)
+hypothesis.settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="session")
+def golden():
+    """The contents of a file of tests/golden, by its name."""
+    return cache(lambda name: json.loads((Path(__file__).parent / "golden" / name).read_text()))

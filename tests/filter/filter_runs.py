@@ -1,0 +1,75 @@
+"""Filter runs for the tests, frame by frame: one compilation for each static configuration, shared by all test files."""
+
+from collections.abc import Iterator
+from functools import cache
+
+import jax
+import numpy as np
+
+from vcjax.filter import slam
+from vcjax.filter.config import FilterConfig
+from vcjax.filter.slam import FrameInfo
+from vcjax.filter.state import SLOT, VEHICLE, FilterState, full_cov, landmark_cov
+from vcjax.recording import Recording
+from vcjax.simulation.scenarios import paper
+from vcjax.simulation.simulate import simulate
+
+CAPACITY = 112
+"""Slots enough for every landmark that 160 frames of the paper's scenarios give birth to."""
+
+start, step = jax.jit(slam.start), jax.jit(slam.step)
+_simulate = jax.jit(simulate)
+
+
+@cache
+def recorded(seed: int, **scenario) -> Recording:
+    """A recording of one of the paper's scenarios, kept in NumPy."""
+    recording, _ = _simulate(paper(**scenario), jax.random.key(seed))
+    return jax.tree.map(np.asarray, recording)
+
+
+def head(recording: Recording, num_frames: int) -> Recording:
+    """The first frames of a recording. (`is_last` still tells of the whole.)"""
+    once = ("camera", "robot_start", "sensor_start", "start_cov")
+    return Recording(**{k: v if k in once else v[:num_frames] for k, v in vars(recording).items()})
+
+
+def filtered(config: FilterConfig, recording: Recording, key=None) -> Iterator[tuple[FilterState, FrameInfo]]:
+    """State and info (in NumPy) of every frame, as `slam.run` has them; runs of all lengths share their compilation."""
+    state, info = start(config, head(recording, 1), key)
+    yield state, jax.device_get(info)
+    for t in range(1, recording.num_frames):
+        state, info = step(config, state, recording.frame(t))
+        yield state, jax.device_get(info)
+
+
+def ids(track_id) -> list[int]:
+    """The ids in an array where -1 stands for none."""
+    return [int(i) for i in track_id if i >= 0]
+
+
+def landmarks(state: FilterState) -> dict[int, tuple[str, np.ndarray, np.ndarray]]:
+    """The map by id: kind, and mean and covariance in the landmark's own 3 or 7 coordinates."""
+    track_id, is_euclidean, means, covs = jax.device_get(
+        (state.track_id, state.is_euclidean, state.landmarks, landmark_cov(state))
+    )
+    found = {}
+    for slot in np.flatnonzero(track_id >= 0):
+        kind, n = ("euclidean", 3) if is_euclidean[slot] else ("ahp", 7)
+        found[int(track_id[slot])] = kind, means[slot, :n], covs[slot, :n, :n]
+    return found
+
+
+def joint(state: FilterState, order: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of vehicle and landmarks, these in the given order, each in its own 3 or 7 coordinates."""
+    vehicle, track_id, is_euclidean, means = jax.device_get(
+        (state.vehicle, state.track_id, state.is_euclidean, state.landmarks)
+    )
+    rows, mean = [np.arange(VEHICLE)], [vehicle]
+    for i in order:
+        (slot,) = np.flatnonzero(track_id == i)
+        n = 3 if is_euclidean[slot] else 7
+        rows.append(VEHICLE + SLOT * slot + np.arange(n))
+        mean.append(means[slot, :n])
+    rows = np.concatenate(rows)
+    return np.concatenate(mean), np.asarray(full_cov(state))[np.ix_(rows, rows)]

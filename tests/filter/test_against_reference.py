@@ -1,0 +1,135 @@
+"""The filter against the independent NumPy EKF-SLAM of `tests/reference`, frame by frame, on simulated recordings.
+
+They agree in every choice and verdict, and in every number to 1e-8: rounding grows to 1e-11 in squared distances of 1e3, and
+1e-13 in states; a wrong formula would show from 1e-6 on. Numbers above one are compared relatively.
+"""
+
+import numpy as np
+import pytest
+from filter_runs import CAPACITY, filtered, head, ids, joint, landmarks, recorded
+from reference.ekf_slam import EkfSlam, Frame, Options
+
+from vcjax.filter.config import FilterConfig
+from vcjax.gates.reprojection import ReprojectionError
+from vcjax.gates.virtual_correction import VirtualCorrection
+
+
+def close(ours, theirs):
+    np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-8)
+
+
+def reference_results(options, recording):
+    """The reference's result of every frame."""
+    r = recording
+    slam = EkfSlam(options, r.camera.intrinsics_px, r.robot_start, r.sensor_start, r.start_cov)
+    for t in range(r.num_frames):
+        seen = r.is_valid[t]
+        yield slam.step(Frame(r.odometry[t], r.odometry_cov[t], r.sensor_shift_m[t], r.track_id[t, seen], r.uv_px[t, seen]))
+
+
+def agree(config, options, recording):
+    """Compare the two in all frames; how many verdicts, deletions, births and conversions there were in all."""
+    counts = dict(accepted=0, recovered=0, dynamic=0, inconsistent=0, born=0, reparametrised=0)
+    frames = enumerate(zip(filtered(config, recording), reference_results(options, recording), strict=True))
+    for t, ((state, info), result) in frames:
+        close(info.vehicle, np.concatenate([result.robot, result.sensor]))
+        close(info.vehicle_cov, result.P)
+        compare_candidates(info, result.candidates, counts)
+        assert sorted(ids(info.inconsistent_id)) == sorted(result.deleted_inconsistent)
+        assert ids(info.born_id) == result.born
+        assert not info.map_is_full  # else the capacity, not the method, would decide
+        counts["inconsistent"] += len(result.deleted_inconsistent)
+        counts["born"] += len(result.born)
+        if t % 20 == 19:
+            compare_maps(landmarks(state), result.landmarks)
+    mean, cov = joint(state, list(result.landmarks))
+    close(mean, result.full_x)
+    close(cov, result.full_P)
+    return counts
+
+
+def compare_candidates(info, candidates, counts):
+    """The same candidates in the same order, with the same numbers and verdicts."""
+    assert ids(info.candidate_id) == [c["id"] for c in candidates]
+    for k, c in enumerate(candidates):
+        verdict = {v: bool(getattr(info, f"is_{v}")[k]) for v in ("accepted", "recovered", "dynamic")}
+        assert verdict == {v: c[v] for v in verdict}
+        assert info.is_measured[k] == c["matched"]
+        if c["matched"]:
+            for ours, theirs in (("pixel", "e"), ("innovation", "z"), ("innovation_cov", "Z"), ("re1", "re1")):
+                close(getattr(info, ours)[k], c[theirs])
+        # NaN on both sides where nothing was judged
+        close(info.re1_prior[k], c["re1_prior"])
+        close(info.re2[k], c["re2"])
+        for name in ("accepted", "recovered", "dynamic", "reparametrised"):
+            counts[name] += c[name]
+
+
+def compare_maps(ours, theirs):
+    """The same landmarks in the same form, with the same mean and covariance."""
+    assert sorted(ours) == sorted(theirs)
+    for i, (kind, mean, cov) in theirs.items():
+        assert ours[i][0] == kind
+        close(ours[i][1], mean)
+        close(ours[i][2], cov)
+
+
+GATES = {"RE": ReprojectionError(), "VC": VirtualCorrection(), "VC_predicted": VirtualCorrection(prior="predicted")}
+
+
+def both(gate, **numbers):
+    """The same choices for the two filters. `numbers` are the reference's names of what differs from the defaults."""
+    names = dict(pixel_std="pixel_std_px", oscillation_std="oscillation_std_m")
+    config = FilterConfig(
+        gate=GATES[gate], max_landmarks=CAPACITY, retire=False, **{names[k]: v for k, v in numbers.items()}
+    )
+    prior = GATES[gate].prior
+    return config, Options(gate=gate[:2], prior=prior, **numbers)
+
+
+# Every pair of factors is among the four that always run; the other four complete the product.
+slow = pytest.mark.slow
+STEADY, OSCILLATING = 0.0, 0.05
+
+
+@pytest.mark.parametrize(
+    ("gate", "amplitude_m", "dynamic"),
+    [
+        ("RE", STEADY, "lateral"),
+        ("RE", OSCILLATING, None),
+        ("VC", STEADY, None),
+        ("VC", OSCILLATING, "inverse_forward"),
+        pytest.param("RE", STEADY, None, marks=slow),
+        pytest.param("RE", OSCILLATING, "inverse_forward", marks=slow),
+        pytest.param("VC", STEADY, "inverse_forward", marks=slow),
+        pytest.param("VC", OSCILLATING, "lateral", marks=slow),
+    ],
+)
+def test_160_frames_forward(gate, amplitude_m, dynamic):
+    recording = recorded(seed=3, robot="forward", dynamic=dynamic, oscillation_amplitude_m=amplitude_m)
+    counts = agree(*both(gate), recording)
+    assert counts["reparametrised"] > 30  # the comparison met every kind of event
+    if gate == "VC":
+        assert counts["recovered"] > 5
+        assert counts["dynamic"] > 0
+    elif dynamic:
+        assert counts["inconsistent"] > 0
+
+
+@pytest.mark.parametrize(
+    ("gate", "scenario", "numbers"),
+    [
+        ("VC", dict(robot="curved", dynamic="lateral"), {}),
+        ("RE", dict(robot="lateral", dynamic="inverse_forward", noise="six_axis"), {}),
+        ("VC", dict(oscillation_amplitude_m=0.05, dynamic="lateral"), dict(oscillation_std=0.003)),
+        ("VC", dict(robot="curved", noise="six_axis", oscillation_amplitude_m=0.08), dict(pixel_std=0.5)),
+        ("VC_predicted", dict(dynamic="lateral", dynamic_set="near_path", oscillation_amplitude_m=0.05), {}),
+    ],
+)
+def test_60_frames_of_other_scenarios(gate, scenario, numbers):
+    counts = agree(*both(gate, **numbers), head(recorded(seed=4, **scenario), 60))
+    assert counts["born"] > 60
+    assert counts["accepted"] > 400
+    if gate != "RE":
+        assert counts["recovered"] > 0
+        assert counts["dynamic"] > 0

@@ -1,0 +1,157 @@
+"""Landmarks: one projection for both kinds, back-projection, conversion and the linearity index."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models.derivatives import assert_exact_derivative, assert_finite
+
+from vcjax.models.camera import Camera
+from vcjax.models.frames import compose, quaternion_from_euler
+from vcjax.models.landmarks import (
+    back_project_landmark,
+    camera_centre,
+    euclidean,
+    linearity_index,
+    project_landmark,
+    to_point,
+    to_point_jacobian,
+)
+
+CAMERAS = {"plain": Camera(), "distorted": Camera(distortion=(-0.3, 0.1))}
+every_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+
+
+def pose(t, rpy_deg):
+    """A pose from its place (m) and Euler angles (deg)."""
+    return jnp.concatenate([jnp.array(t), quaternion_from_euler(jnp.deg2rad(jnp.array(rpy_deg)))])
+
+
+ROBOT = pose([1.0, -2.0, 0.1], [3.0, -4.0, 50.0])
+SENSOR = pose([0.1, 0.05, 0.6], [-92.0, 3.0, -88.0])
+CENTRE = camera_centre(ROBOT, SENSOR)
+# In front of the camera, seen from somewhere else first.
+AHP = jnp.array([0.7, -2.2, 0.5, 0.5, 0.8, 0.1, 0.3])
+
+
+@every_camera
+@pytest.mark.parametrize("landmark", [AHP, euclidean(to_point(AHP))], ids=["AHP", "Euclidean"])
+def test_jacobians_of_projection_are_its_derivatives(camera, landmark):
+    def pixel(robot, sensor, landmark):
+        return project_landmark(camera, robot, sensor, landmark)[0]
+
+    jacobians = project_landmark(camera, ROBOT, SENSOR, landmark)[2:]
+    for ours, exact in zip(jacobians, jax.jacfwd(pixel, (0, 1, 2))(ROBOT, SENSOR, landmark), strict=True):
+        np.testing.assert_allclose(ours, exact, rtol=0, atol=1e-10)
+    assert_exact_derivative(pixel, ROBOT, SENSOR, landmark)
+
+
+@every_camera
+def test_both_kinds_of_one_point_are_seen_alike(camera):
+    pixel, depth, U_r, U_s, U_l = project_landmark(camera, ROBOT, SENSOR, AHP)
+    pixel_e, depth_e, U_re, U_se, U_le = project_landmark(camera, ROBOT, SENSOR, euclidean(to_point(AHP)))
+    for a, b in ((pixel, pixel_e), (depth, depth_e), (U_r, U_re), (U_s, U_se), (U_l, U_le[:, :3] @ to_point_jacobian(AHP))):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11)
+
+
+def test_depth_is_the_distance_along_the_optical_axis():
+    T_w_c = compose(ROBOT, SENSOR)
+    from vcjax.models.frames import from_frame
+
+    ahead, behind = (from_frame(T_w_c, jnp.array([0.4, -0.2, z])) for z in (3.0, -3.0))
+    assert project_landmark(Camera(), ROBOT, SENSOR, euclidean(ahead))[1] == pytest.approx(3.0, abs=1e-12)
+    assert project_landmark(Camera(), ROBOT, SENSOR, euclidean(behind))[1] == pytest.approx(-3.0, abs=1e-12)
+
+
+@every_camera
+@pytest.mark.parametrize("inverse_depth", [0.01, 1.5])
+def test_new_landmark_lies_on_the_ray_of_its_pixel(camera, inverse_depth):
+    pixel = jnp.array([100.0, 400.0])
+    landmark = back_project_landmark(camera, ROBOT, SENSOR, pixel, inverse_depth)
+    np.testing.assert_allclose(landmark[:3], CENTRE, rtol=0, atol=0)
+    assert jnp.linalg.norm(landmark[3:6]) == pytest.approx(1.0, abs=1e-14)
+    assert landmark[6] == inverse_depth
+    assert jnp.linalg.norm(to_point(landmark) - CENTRE) == pytest.approx(1 / inverse_depth, rel=1e-13)
+    np.testing.assert_allclose(project_landmark(camera, ROBOT, SENSOR, landmark)[0], pixel, rtol=0, atol=1e-9)
+
+
+@every_camera
+def test_derivative_of_back_projection_is_exact(camera):
+    def landmark(robot, sensor, pixel, inverse_depth):
+        return back_project_landmark(camera, robot, sensor, pixel, inverse_depth)
+
+    assert_exact_derivative(landmark, ROBOT, SENSOR, jnp.array([100.0, 400.0]), jnp.array(0.3))
+
+
+def test_scalar_derivative_changes_the_derivative_of_the_direction_only():
+    def landmark(pixel, scalar):
+        return back_project_landmark(Camera(), ROBOT, SENSOR, pixel, 0.3, scalar)
+
+    pixel = jnp.array([100.0, 400.0])
+    np.testing.assert_array_equal(landmark(pixel, True), landmark(pixel, False))
+    exact, scalar = (jax.jacfwd(landmark)(pixel, s) for s in (False, True))
+    direction = landmark(pixel, False)[3:6]
+    np.testing.assert_allclose(direction @ exact[3:6], 0, atol=1e-15)
+    # The exact derivative is the scalar one without its part along the direction.
+    np.testing.assert_allclose(exact[3:6], (np.eye(3) - np.outer(direction, direction)) @ scalar[3:6], atol=1e-15)
+    np.testing.assert_array_equal(np.delete(exact, [3, 4, 5], 0), np.delete(scalar, [3, 4, 5], 0))
+
+
+def test_conversion_keeps_the_point_and_moves_its_covariance():
+    rng = np.random.default_rng(2)
+    L = 1e-4 * np.tril(rng.normal(size=(7, 7)))
+    samples = jax.vmap(to_point)(AHP + jnp.array(rng.normal(size=(200_000, 7)) @ L.T))
+    J = to_point_jacobian(AHP)
+    np.testing.assert_allclose(J, jax.jacrev(to_point)(AHP), rtol=0, atol=1e-14)
+    expected = J @ (L @ L.T) @ J.T
+    # 200 000 samples give a covariance to about 1/√100 000 of its diagonal.
+    np.testing.assert_allclose(np.cov(samples.T), expected, rtol=0, atol=0.015 * expected.diagonal().max())
+
+
+def test_linearity_index_is_the_formula():
+    to_landmark = np.asarray(to_point(AHP) - CENTRE)
+    distance = np.linalg.norm(to_landmark)
+    cosine = to_landmark @ AHP[3:6] / distance / np.linalg.norm(AHP[3:6])
+    expected = 4 * (0.02 / 0.3**2) / distance * abs(cosine)
+    assert linearity_index(ROBOT, SENSOR, AHP, 0.02) == pytest.approx(float(expected), rel=1e-13)
+
+
+def test_linearity_index_vanishes_when_the_point_is_seen_from_the_side():
+    point = to_point(AHP)
+    aside = jnp.cross(AHP[3:6], jnp.array([0.0, 0.0, 1.0]))
+    # The pose of a camera at the robot's origin, beside the point.
+    robot = ROBOT.at[:3].set(point + aside)
+    sensor = SENSOR.at[:3].set(0.0)
+    assert linearity_index(robot, sensor, AHP, 0.02) == pytest.approx(0.0, abs=1e-14)
+
+
+def test_derivative_of_linearity_index_is_exact():
+    assert_exact_derivative(linearity_index, ROBOT, SENSOR, AHP, jnp.array(0.02))
+
+
+EDGES = {
+    "inverse depth at its clamp": AHP.at[6].set(0.001),
+    "inverse depth zero": AHP.at[6].set(0.0),
+    "anchored here": jnp.concatenate([CENTRE, AHP[3:]]),
+    "point at the camera": euclidean(CENTRE),
+    "ray in the camera's plane": jnp.concatenate([CENTRE, compose(ROBOT, SENSOR)[3:6] * 0, jnp.array([0.001])]),
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("landmark", EDGES.values(), ids=EDGES)
+def test_projection_is_finite_at_the_edges(camera, landmark):
+    assert_finite(lambda *x: project_landmark(camera, *x), ROBOT, SENSOR, landmark)
+
+
+@pytest.mark.parametrize("landmark", [euclidean(CENTRE), AHP.at[6].set(0.001)], ids=["at the camera", "at the clamp"])
+def test_linearity_index_is_finite_at_the_edges(landmark):
+    assert_finite(linearity_index, ROBOT, SENSOR, landmark, jnp.array(0.5))
+
+
+def test_back_projection_of_a_far_point_is_finite():
+    assert_finite(
+        lambda pixel, rho: back_project_landmark(Camera(), ROBOT, SENSOR, pixel, rho),
+        jnp.array([320.0, 240.0]),
+        jnp.array(0.0),
+    )

@@ -1,0 +1,1 @@
+"""Many runs: Monte Carlo, figures of merit, and the paper's experiments."""

@@ -1,0 +1,76 @@
+"""One run against its truth: trajectory errors, consistency, and what was detected. Computed inside the batch."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from vcjax.ekf import mahalanobis
+from vcjax.filter.slam import FrameInfo
+from vcjax.models.frames import quaternion_conjugate, quaternion_product, yaw_from_quaternion
+from vcjax.recording import Truth
+
+
+def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
+    """All that is kept of a run: per frame (T,) or per feature (F,), under the names of the results.
+
+    Errors are not aligned: estimate and truth start from the same known pose. Derivatives are exact where continuous.
+    """
+    num_features = truth.is_moving.shape[0]
+    dynamic_id = jnp.where(info.is_dynamic, info.candidate_id, -1)
+    return {
+        **trajectory_errors(info, truth),
+        "nis_sum": jnp.sum(jnp.where(info.is_accepted, info.re1, 0.0), axis=1),
+        "num_updates": jnp.sum(info.is_accepted, axis=1),
+        "num_recovered": jnp.sum(info.is_recovered, axis=1),
+        "num_dynamic": jnp.sum(info.is_dynamic, axis=1),
+        "num_inconsistent": jnp.sum(info.inconsistent_id >= 0, axis=1),
+        "num_births": jnp.sum(info.born_id >= 0, axis=1),
+        "num_landmarks": jnp.sum(info.track_id >= 0, axis=1),
+        "dynamic_deletions": _count_by_feature(dynamic_id, num_features),
+        "inconsistent_deletions": _count_by_feature(info.inconsistent_id, num_features),
+        "frames_mapped": _count_by_feature(info.track_id, num_features),
+        "is_moving": truth.is_moving,
+        "is_finite": jnp.all(info.is_finite),
+        "map_full_frames": jnp.sum(info.map_is_full),
+        "robot": info.vehicle[:, :7],
+    }
+
+
+def trajectory_errors(info: FrameInfo, truth: Truth) -> dict[str, Float[Array, " T"]]:
+    """Errors of the robot pose in each frame and their normalised squares.
+
+    `position_error_m` is √(ex² + ey²); `orientation_error_deg` the angle between the true and the estimated orientation;
+    `yaw_error_deg` the absolute error of the yaw angle. `nees_position` = eᵀ P⁻¹ e of (x, y), 2 degrees of freedom, and
+    `nees_pose` of (x, y, yaw), 3: in a consistent filter their means are 2 and 3.
+    """
+    robot, cov = info.vehicle[:, :7], info.vehicle_cov[:, :7, :7]
+    error_xy = robot[:, :2] - truth.robot[:, :2]
+    relative = jax.vmap(lambda q, p: quaternion_product(quaternion_conjugate(q), p))(truth.robot[:, 3:], robot[:, 3:])
+    sine = jnp.sqrt(jnp.sum(relative[:, 1:] ** 2, axis=1))
+    yaw, yaw_H = jax.vmap(jax.value_and_grad(yaw_from_quaternion))(robot[:, 3:])
+    error_yaw = _wrap(yaw - jax.vmap(yaw_from_quaternion)(truth.robot[:, 3:]))
+
+    # Pose (x, y, yaw) as a linear function of the error in [x y z qw qx qy qz].
+    G = jnp.zeros((robot.shape[0], 3, 7), robot.dtype)
+    G = G.at[:, 0, 0].set(1.0).at[:, 1, 1].set(1.0).at[:, 2, 3:].set(yaw_H)
+    pose_cov = G @ cov @ G.mT
+    error_pose = jnp.concatenate([error_xy, error_yaw[:, None]], axis=1)
+    solved = jnp.linalg.solve(pose_cov, error_pose[..., None])[..., 0]
+    return {
+        "position_error_m": jnp.sqrt(jnp.sum(error_xy**2, axis=1)),
+        "orientation_error_deg": jnp.rad2deg(2.0 * jnp.arctan2(sine, jnp.abs(relative[:, 0]))),
+        "yaw_error_deg": jnp.rad2deg(jnp.abs(error_yaw)),
+        "nees_position": jax.vmap(mahalanobis)(error_xy, cov[:, :2, :2]),
+        "nees_pose": jnp.sum(error_pose * solved, axis=1),
+    }
+
+
+def _wrap(angle: Float[Array, " T"]) -> Float[Array, " T"]:
+    """An angle (rad) brought to [-π, π)."""
+    return (angle + jnp.pi) % (2.0 * jnp.pi) - jnp.pi
+
+
+def _count_by_feature(ids: Int[Array, "T n"], num_features: int) -> Int[Array, " F"]:
+    """How often each feature is among the ids; -1 counts for none."""
+    places = jnp.where(ids >= 0, ids, num_features).ravel()
+    return jnp.zeros(num_features, jnp.int32).at[places].add(1, mode="drop")

@@ -1,0 +1,145 @@
+"""Monte Carlo in one call: all seeds, and all points of a sweep, as one compiled batch.
+
+A **lane** is one run: one seed at one point of the sweep. Lanes are split over the devices; each device works through its
+part in small batches. On a CPU a batch is a single lane, so that the lane's covariance stays in cache; on an
+accelerator it is all of them. A lane's result depends on its seed number and its numbers only, not on how lanes are
+grouped.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, PRNGKeyArray
+
+from vcjax.filter.config import FilterConfig
+from vcjax.filter.slam import run
+from vcjax.simulation.scenarios import Scenario
+from vcjax.simulation.simulate import simulate
+from vcjax.study.metrics import run_metrics
+from vcjax.study.results import as_dataset
+from vcjax.study.sweep import Experiment, Sweep, check_sweep, replace_at
+
+MAX_LANES_PER_CALL = 256
+"""Lanes in one compiled call: what is finished between two reports of progress, and a bound on memory."""
+
+
+
+def monte_carlo(
+    scenario: Scenario,
+    config: FilterConfig | None = None,
+    *,
+    num_seeds: int = 25,
+    key: PRNGKeyArray,
+    first_seed: int = 0,
+    sweep: Sweep | None = None,
+    devices: Sequence[jax.Device] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+):
+    """Run a scenario for many seeds, and for every point of a sweep, and compare with the truth.
+
+    Seed i uses `fold_in(key, i)` whatever scenario, gate or sweep point it runs: differences are paired (common random
+    numbers). Nothing compiles again for other values of numeric leaves.
+
+    Args:
+        scenario: the experiment.
+        config: filter configuration; the paper's VC filter if None.
+        num_seeds: number of runs for each point of the sweep, at least 1.
+        key: base key, e.g. `jax.random.key(0)`.
+        first_seed: number of the first seed; seeds are `first_seed … first_seed + num_seeds - 1`.
+        sweep: path of a numeric leaf → values, e.g. `{"config.gate.th1": [6, 9, 12], "scenario.oscillation.amplitude_m":
+            [0, 0.05]}`; several paths span a grid.
+        devices: devices to use; all local ones if None.
+        progress: called with (lanes done, lanes in all).
+
+    Returns:
+        xarray.Dataset with dimensions (*sweep paths, seed, frame or feature); see `results.as_dataset`.
+
+    Raises:
+        ValueError: for bad numbers of seeds, unknown sweep paths or values out of range, before anything compiles.
+        ModuleNotFoundError: if xarray is not installed.
+    """
+    if num_seeds < 1:
+        raise ValueError(f"monte_carlo(num_seeds={num_seeds}): give at least one seed.")
+    if first_seed < 0:
+        raise ValueError(f"monte_carlo(first_seed={first_seed}): seeds are numbered from 0.")
+    experiment = Experiment(scenario, FilterConfig() if config is None else config)
+    values = check_sweep(experiment, sweep or {})
+    seeds = np.arange(first_seed, first_seed + num_seeds)
+    axes = np.meshgrid(*values.values(), seeds, indexing="ij")
+    shape = axes[0].shape
+    *swept, lane_seed = (axis.ravel() for axis in axes)
+    lanes = run_lanes(experiment, dict(zip(values, swept, strict=True)), lane_seed, key, devices, progress)
+    lanes = {name: value.reshape(*shape, *value.shape[1:]) for name, value in lanes.items()}
+    return as_dataset(lanes, experiment, values, seeds, key)
+
+
+def run_lanes(
+    experiment: Experiment,
+    swept: dict[str, np.ndarray],
+    seeds: np.ndarray,
+    key: PRNGKeyArray,
+    devices: Sequence[jax.Device] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """Run a list of lanes, in calls of equal size so that one compilation serves all.
+
+    Args:
+        experiment: scenario and configuration.
+        swept: path → value of each lane.
+        seeds: seed number of each lane.
+        key: base key.
+        devices: devices to use; all local ones if None.
+        progress: called with (lanes done, lanes in all).
+
+    Returns: the metrics of `metrics.run_metrics`, each with the lanes as leading axis.
+    """
+    devices = jax.local_devices() if devices is None else list(devices)
+    mesh = Mesh(np.array(devices), ("lane",))
+    total = len(seeds)
+    num_calls = math.ceil(total / MAX_LANES_PER_CALL)
+    size = math.ceil(total / num_calls / len(devices)) * len(devices)
+    batch_size = 1 if devices[0].platform == "cpu" else size
+    done = []
+    for first in range(0, total, size):
+        # The last call is filled up with copies of its last lane, to have the shape of the others.
+        lane = np.minimum(np.arange(first, first + size), total - 1)
+        values = {path: value[lane] for path, value in swept.items()}
+        result = _run_lanes(experiment, values, jnp.asarray(seeds[lane], jnp.uint32), key, mesh, batch_size)
+        num_new = min(size, total - first)
+        done.append({name: np.asarray(value)[:num_new] for name, value in result.items()})
+        if progress is not None:
+            progress(first + num_new, total)
+    return {name: np.concatenate([part[name] for part in done]) for name in done[0]}
+
+
+@partial(jax.jit, static_argnames=("mesh", "batch_size"))
+def _run_lanes(experiment, swept, seeds, key, mesh: Mesh, batch_size: int) -> dict[str, Array]:
+    def run_lane(lane):
+        swept, seed = lane
+        point = experiment
+        for path, value in swept.items():
+            point = replace_at(point, path, value)
+        return run_one(point, jax.random.fold_in(key, seed))
+
+    def run_part(swept, seeds):
+        return jax.lax.map(run_lane, (swept, seeds), batch_size=None if batch_size == 1 else batch_size)
+
+    lanes = PartitionSpec("lane")
+    # Lanes do not talk to each other, so there is nothing to check of what varies over the mesh.
+    return jax.shard_map(run_part, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)(swept, seeds)
+
+
+def run_one(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Array]:
+    """One run: simulate, filter, compare with the truth. Pure; the function to differentiate or to batch otherwise."""
+    recording, truth = simulate(experiment.scenario, key)
+    # Births in random order draw from a key of their own, so that they do not disturb the noise.
+    birth_key = jax.random.fold_in(key, 1) if experiment.config.birth_order == "random" else None
+    _, info = run(experiment.config, recording, birth_key)
+    return run_metrics(info, truth)
+
+

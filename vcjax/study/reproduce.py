@@ -1,0 +1,163 @@
+"""The paper's experiments, all cells, with every finished piece on disk.
+
+A directory holds, for each cell of Tables 2–5, blocks of `SEEDS_PER_BLOCK` seeds: `runs/<cell>/seeds_00000-00024.nc`. What is
+there is not run again, so a run that was stopped goes on where it was, and a larger number of seeds extends a smaller one.
+"""
+
+import json
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from vcjax.filter.config import FilterConfig
+from vcjax.gates.gate import AbstractGate
+from vcjax.gates.reprojection import ReprojectionError
+from vcjax.gates.virtual_correction import VirtualCorrection
+from vcjax.simulation.scenarios import paper
+from vcjax.study.monte_carlo import monte_carlo
+from vcjax.study.paper import TABLES, Cell, cells
+from vcjax.study.results import attributes, load, save
+from vcjax.study.storage import write_file
+from vcjax.study.sweep import Experiment
+
+SEEDS_PER_BLOCK = 25
+OSCILLATION_AMPLITUDE_M = 0.05
+"""A of the paper's oscillating camera (Table 1)."""
+GATES: Mapping[str, Callable[[], AbstractGate]] = {"RE": ReprojectionError, "VC": VirtualCorrection}
+"""The gates by their names in the paper."""
+
+_BLOCK_NAME = re.compile(r"seeds_(\d{5})-(\d{5})\.nc")
+
+
+def cell_experiment(cell: Cell) -> Experiment:
+    """Scenario and configuration of a cell."""
+    scenario = paper(
+        robot=cell.robot_motion,  # type: ignore[arg-type]
+        dynamic=cell.dynamic_motion,  # type: ignore[arg-type]
+        dynamic_speed_m_s=cell.dynamic_speed_m_s or 0.0,
+        oscillation_amplitude_m=OSCILLATION_AMPLITUDE_M if cell.oscillating else 0.0,
+    )
+    return Experiment(scenario, FilterConfig(gate=GATES[cell.gate]()))
+
+
+def reproduce(
+    directory: str | Path,
+    *,
+    num_seeds: int = 25,
+    tables: Collection[int] = TABLES,
+    key: PRNGKeyArray | None = None,
+    progress: Callable[[int, int, Cell], None] | None = None,
+) -> dict[Cell, Any]:
+    """Run every cell of the paper's tables, and RE with the oscillating camera, which the paper left out.
+
+    Args:
+        directory: where results are kept; made if needed. Blocks that are there already are read, not run.
+        num_seeds: runs per cell, at least 1.
+        tables: which of 2, 3, 4, 5.
+        key: base key; `jax.random.key(0)` if None.
+        progress: called with (blocks done, blocks in all, cell) after each block.
+
+    Returns: the runs of each cell, an `xarray.Dataset` as from `monte_carlo`.
+
+    Raises:
+        ValueError: for a bad number of seeds or table, or if the directory holds results of other settings.
+        OSError: if the directory cannot be written.
+    """
+    if num_seeds < 1:
+        raise ValueError(f"reproduce(num_seeds={num_seeds}): give at least one seed.")
+    directory, chosen = Path(directory), cells(tables)
+    key = jax.random.key(0) if key is None else key
+    write_file(directory / "README.txt", _README.encode())  # also tells at once whether the place can be written
+    blocks = [(first, min(first + SEEDS_PER_BLOCK, num_seeds)) for first in range(0, num_seeds, SEEDS_PER_BLOCK)]
+    # Gate by gate, since each compiles once; the paper's order within.
+    work = [(cell, block) for gate in GATES for cell in chosen if cell.gate == gate for block in blocks]
+    for done, (cell, (first, end)) in enumerate(work, start=1):
+        _run_block(directory / "runs" / cell.identifier, cell, first, end, key)
+        if progress is not None:
+            progress(done, len(work), cell)
+    return load_results(directory, tables=tables, num_seeds=num_seeds)
+
+
+def load_results(
+    directory: str | Path, *, tables: Collection[int] = TABLES, num_seeds: int | None = None
+) -> dict[Cell, Any]:
+    """Read what a directory holds of the cells, over the seeds that all of them have (at most `num_seeds`).
+
+    Raises:
+        FileNotFoundError: if it holds no results.
+        ValueError: if a file is not readable.
+    """
+    results = {}
+    for cell in cells(tables):
+        blocks = [load(path) for _, _, path in _blocks(Path(directory) / "runs" / cell.identifier)]
+        if blocks:
+            results[cell] = _join(blocks)
+    if not results:
+        raise FileNotFoundError(f"{directory}: no results of the paper's cells here; run `vcjax reproduce` first.")
+    shared = set.intersection(*(set(runs.seed.values.tolist()) for runs in results.values()))
+    seeds = sorted(seed for seed in shared if num_seeds is None or seed < num_seeds)
+    if not seeds:
+        raise ValueError(f"{directory}: the cells have no seed in common; run `vcjax reproduce` again to complete them.")
+    return {cell: runs.sel(seed=seeds) for cell, runs in results.items()}
+
+
+def _run_block(folder: Path, cell: Cell, first: int, end: int, key: PRNGKeyArray) -> None:
+    """Run one block of seeds unless it is there; a shorter one of the same first seed is replaced by the longer."""
+    experiment = cell_experiment(cell)
+    for found_first, found_end, path in _blocks(folder):
+        if found_first == first:
+            _refuse_other_settings(path, experiment, key)
+            if found_end >= end:
+                return
+    runs = monte_carlo(experiment.scenario, experiment.config, num_seeds=end - first, first_seed=first, key=key)
+    written = save(runs, folder / f"seeds_{first:05d}-{end - 1:05d}.nc")
+    for found_first, _, path in list(_blocks(folder)):
+        if found_first == first and path != written:
+            path.unlink()
+
+
+def _blocks(folder: Path) -> Iterator[tuple[int, int, Path]]:
+    """First seed, end and path of the blocks in a folder, in order."""
+    for path in sorted(folder.glob("seeds_*.nc")):
+        if match := _BLOCK_NAME.fullmatch(path.name):
+            yield int(match[1]), int(match[2]) + 1, path
+
+
+def _refuse_other_settings(path: Path, experiment: Experiment, key: PRNGKeyArray) -> None:
+    """Refuse to mix results of different settings."""
+    found = load(path).attrs
+    for name, value in attributes(experiment, key).items():
+        if found.get(name) != value:
+            raise ValueError(
+                f"{path} has other settings ({name}: {_short(found.get(name))}, now {_short(value)}); "
+                "give another directory, or remove this one."
+            )
+
+
+def _join(blocks: list[Any]) -> Any:
+    """Blocks of one cell as one data set; what does not depend on the seed is taken from the first."""
+    import xarray as xr
+
+    unique = [block.sel(seed=~block.get_index("seed").duplicated()) for block in blocks]
+    joined = xr.concat(unique, "seed", data_vars="minimal", coords="minimal", compat="override", join="override")
+    return joined.isel(seed=np.unique(joined.seed.values, return_index=True)[1])
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 60 else text[:57] + "..."
+
+
+_README = """\
+Results of `vcjax reproduce`: the experiments of the paper's Tables 2-5.
+runs/        the runs of each cell, NetCDF-4, in blocks of seeds; nothing else is needed to make the rest again
+tables.json  every figure of every cell beside the paper's, and differences paired by seed
+tables.md    the same for people
+figures/     Figures 3-6
+Make tables and figures again with `vcjax report` and this directory.
+"""

@@ -1,0 +1,155 @@
+"""Labelled results, in memory and on disk.
+
+Results are an `xarray.Dataset`, on disk one NetCDF-4 file: labelled, self-describing, readable from any language, and a
+single file, which can be written under a temporary name and renamed, so that a file that exists is complete.
+"""
+
+import dataclasses
+import json
+import os
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from vcjax.simulation.scenarios import Scenario
+from vcjax.simulation.simulate import simulate
+from vcjax.study.storage import replacing
+from vcjax.study.sweep import Experiment
+
+SCHEMA = 1
+"""Version of the layout of results, raised when an older reader would misread them."""
+
+PER_FRAME = {
+    "position_error_m": "√(ex² + ey²) of the robot, m",
+    "orientation_error_deg": "angle between true and estimated orientation, deg",
+    "yaw_error_deg": "absolute yaw error, deg",
+    "nees_position": "normalised estimation error squared of (x, y), 2 degrees of freedom",
+    "nees_pose": "normalised estimation error squared of (x, y, yaw), 3 degrees of freedom",
+    "nis_sum": "sum of the accepted updates' RE1, 2 degrees of freedom each",
+    "num_updates": "accepted updates",
+    "num_recovered": "recovered by the gate",
+    "num_dynamic": "called dynamic by the gate and deleted",
+    "num_inconsistent": "deleted by the detector",
+    "num_births": "features initialised",
+    "num_landmarks": "landmarks in the map",
+}
+PER_FEATURE = {
+    "dynamic_deletions": "how often the gate called a feature dynamic",
+    "inconsistent_deletions": "how often the detector deleted a feature",
+    "frames_mapped": "frames a feature spent in the map",
+}
+PER_RUN = {
+    "is_finite": "whether all numbers of the run stayed finite",
+    "map_full_frames": "frames in which a feature had to wait for a free slot",
+}
+
+
+def as_dataset(
+    lanes: dict[str, np.ndarray],
+    experiment: Experiment,
+    swept: dict[str, np.ndarray],
+    seeds: np.ndarray,
+    key: PRNGKeyArray,
+) -> Any:
+    """Label a batch's metrics: dimensions (*sweep paths, seed, frame | feature), coordinates, descriptions, settings.
+
+    Variables are those of `PER_FRAME`, `PER_FEATURE` and `PER_RUN`, the estimated `robot` pose, `is_moving` for each
+    feature, and, unless the scenario is swept, the truth: `robot_true`, `sensor_true`, `landmark_true`.
+
+    Raises:
+        ModuleNotFoundError: if xarray is not installed, with the remedy.
+    """
+    xr = _xarray()
+    outer = (*swept, "seed")
+    data = {name: ((*outer, "frame"), lanes[name], {"long_name": text}) for name, text in PER_FRAME.items()}
+    data |= {name: ((*outer, "feature"), lanes[name], {"long_name": text}) for name, text in PER_FEATURE.items()}
+    data |= {name: (outer, lanes[name], {"long_name": text}) for name, text in PER_RUN.items()}
+    data["robot"] = ((*outer, "frame", "pose"), lanes["robot"], {"long_name": "estimated robot pose"})
+    # What moves does not depend on the seed.
+    data["is_moving"] = ((*swept, "feature"), lanes["is_moving"][..., 0, :], {"long_name": "whether a feature moves"})
+    if not any(path.startswith("scenario.") for path in swept):
+        truth = _truth(experiment.scenario)
+        data["robot_true"] = (("frame", "pose"), np.asarray(truth.robot), {"long_name": "true robot pose"})
+        data["sensor_true"] = (("frame", "pose"), np.asarray(truth.sensor), {"long_name": "true sensor pose"})
+        data["landmark_true"] = (("frame", "feature", "axis"), np.asarray(truth.landmarks_m), {"long_name": "features, m"})
+    coordinates = {
+        **{path: ((path,), values) for path, values in swept.items()},
+        "seed": seeds,
+        "frame": np.arange(1, experiment.scenario.num_frames + 1),
+        "feature": np.arange(lanes["is_moving"].shape[-1]),
+        "pose": ["x", "y", "z", "qw", "qx", "qy", "qz"],
+        "axis": ["x", "y", "z"],
+    }
+    return xr.Dataset(data, coordinates, attrs=attributes(experiment, key))
+
+
+@jax.jit
+def _truth(scenario: Scenario):
+    return simulate(scenario, jax.random.key(0))[1]
+
+
+def attributes(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Any]:
+    """What results come from, as it is kept beside them: equal attributes, equal numbers."""
+    return {
+        "schema": SCHEMA,
+        "scenario": json.dumps(describe(experiment.scenario)),
+        "config": json.dumps(describe(experiment.config)),
+        "key": json.dumps(np.asarray(jax.random.key_data(key)).tolist()),
+        "dtype": str(jax.dtypes.canonicalize_dtype(np.float64)),
+        "vcjax": version("vcjax"),
+    }
+
+
+def describe(tree: Any) -> Any:
+    """A configuration object as plain dictionaries, lists and numbers, with the class of each under `class`."""
+    if dataclasses.is_dataclass(tree):
+        fields = {field.name: describe(getattr(tree, field.name)) for field in dataclasses.fields(tree)}
+        return {"class": type(tree).__name__, **fields}
+    if eqx.is_array(tree):
+        return np.asarray(tree).tolist()
+    return tree
+
+
+def save(dataset: Any, path: str | os.PathLike) -> Path:
+    """Write results to one NetCDF file, complete or not at all: to a temporary name, flushed, then renamed.
+
+    Raises:
+        OSError: if the place cannot be written; what was there before stays.
+    """
+    compressed = {name: {"zlib": True, "complevel": 4} for name, variable in dataset.items() if variable.ndim}
+    with replacing(path) as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
+    return Path(path)
+
+
+def load(path: str | os.PathLike) -> Any:
+    """Read results back, whole.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no results file of this schema.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such results file.")
+    try:
+        dataset = _xarray().load_dataset(path, engine="h5netcdf")
+    except (OSError, ValueError, KeyError) as error:
+        raise ValueError(f"{path}: not a readable NetCDF-4 file ({error}).") from error
+    found = dataset.attrs.get("schema")
+    if found != SCHEMA:
+        raise ValueError(f"{path}: schema {found}, but this version reads {SCHEMA}.")
+    return dataset
+
+
+def _xarray() -> Any:
+    """The labelled-array library, an optional dependency."""
+    try:
+        import xarray
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("Labelled results need xarray: pip install 'vcjax[study]'.") from error
+    return xarray

@@ -1,0 +1,52 @@
+"""Files that are complete or not there: written under a temporary name in the same folder, flushed, then renamed."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike) -> Iterator[Path]:
+    """A temporary path to write to, which becomes `path` when the block ends; folders are made as needed.
+
+    If the block fails, what was at `path` before stays, and the temporary file goes. Leftovers of a process that was killed
+    while writing the same file are removed.
+
+    Raises:
+        OSError: if the place cannot be written.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for leftover in path.parent.glob(f".{path.name}.*.tmp"):
+        leftover.unlink(missing_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with open(temporary, "rb") as written:
+            os.fsync(written.fileno())
+        temporary.chmod(0o666 & ~_umask())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_file(path: str | os.PathLike, content: bytes) -> Path:
+    """Write a file at once, complete or not at all.
+
+    Raises:
+        OSError: if the place cannot be written; what was there before stays.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+    return Path(path)
+
+
+def _umask() -> int:
+    """The process's mask of permissions: temporary files are private, finished ones as any other file."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

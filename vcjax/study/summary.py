@@ -1,0 +1,225 @@
+"""Figures of merit of Monte-Carlo runs: per run, across seeds, and as differences paired by seed.
+
+A run's figure is computed first and then averaged over the runs (paper section 4), so that every mean has a standard
+error. Runs that went non-finite are left out of the averages and counted. All functions take one cell's runs with the
+dimensions `seed`, `frame` and `feature` and keep any further (sweep) dimensions.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy import stats
+
+FIGURES = {
+    "position_rmse_cm": "position RMSE, cm",
+    "orientation_error_deg": "orientation error, deg",
+    "yaw_error_deg": "yaw error, deg",
+    "recovered_per_run": "recovered features",
+    "dynamic_events_per_run": "dynamic events",
+    "dynamic_verdicts_per_run": "… by the gate's verdict",
+    "inconsistent_deletions_per_run": "… by the detector",
+    "dynamic_found_per_run": "movers found",
+    "static_deleted_per_run": "static deleted",
+    "anees_position": "ANEES position (2 dof)",
+    "anees_pose": "ANEES pose (3 dof)",
+    "nis": "NIS / 2",
+}
+"""Every per-run figure and its label, in the order of print."""
+
+DECIMALS = dict.fromkeys(FIGURES, 2) | {"orientation_error_deg": 4, "yaw_error_deg": 4}
+"""Decimals shown of each figure: one more than a standard error over 25 runs warrants."""
+
+_DOF = {"anees_position": 2, "anees_pose": 3}
+_CONFIDENCE = 0.95
+_SWEPT = (
+    "position_rmse_cm",
+    "orientation_error_deg",
+    "recovered_per_run",
+    "dynamic_events_per_run",
+    "dynamic_found_per_run",
+    "static_deleted_per_run",
+    "anees_position",
+)  # what fits on one line per point of a sweep
+
+
+def per_run(runs: xr.Dataset) -> xr.Dataset:
+    """Figures of each run: RMS errors over the frames, counts of events, and normalised consistency statistics.
+
+    Errors are √(mean over frames of e²). A dynamic event is any deletion, by the gate's verdict or by the detector;
+    `dynamic_found_per_run` and `static_deleted_per_run` count distinct moving and static features deleted at least
+    once. ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter. `nis` is the mean
+    squared Mahalanobis distance of the accepted updates / 2, NaN where there was none; the gate cuts its tail off, so a
+    consistent filter has 1 − t·exp(−t) / (1 − exp(−t)) with t = Th₁ / 2, which is 0.95 for Th₁ = 9.
+
+    Args:
+        runs: one cell's runs with dimensions (..., seed, frame, feature).
+
+    Returns:
+        The variables named in `FIGURES` and `is_finite`, each (..., seed); figures of failed runs are NaN.
+    """
+    was_deleted = (runs.dynamic_deletions + runs.inconsistent_deletions) > 0
+    num_updates = runs.num_updates.sum("frame")
+    verdicts, inconsistent = runs.num_dynamic.sum("frame"), runs.num_inconsistent.sum("frame")
+    with np.errstate(over="ignore", invalid="ignore"):  # a failed run may hold anything; it is masked below
+        figures = xr.Dataset(
+            {
+                "position_rmse_cm": 100.0 * _rms(runs.position_error_m),
+                "orientation_error_deg": _rms(runs.orientation_error_deg),
+                "yaw_error_deg": _rms(runs.yaw_error_deg),
+                "recovered_per_run": runs.num_recovered.sum("frame"),
+                "dynamic_events_per_run": verdicts + inconsistent,
+                "dynamic_verdicts_per_run": verdicts,
+                "inconsistent_deletions_per_run": inconsistent,
+                "dynamic_found_per_run": (was_deleted & runs.is_moving).sum("feature"),
+                "static_deleted_per_run": (was_deleted & ~runs.is_moving).sum("feature"),
+                "anees_position": runs.nees_position.mean("frame", skipna=False) / _DOF["anees_position"],
+                "anees_pose": runs.nees_pose.mean("frame", skipna=False) / _DOF["anees_pose"],
+                "nis": runs.nis_sum.sum("frame", skipna=False) / num_updates.where(num_updates > 0) / 2,
+            }
+        )
+    return figures.where(runs.is_finite).assign(is_finite=runs.is_finite)
+
+
+def mean_and_error(values: xr.DataArray, is_finite: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
+    """Mean over the finite seeds and its standard error s / √n, with n − 1 in the variance.
+
+    Args:
+        values: (..., seed, ...).
+        is_finite: (..., seed), which runs count.
+
+    Returns:
+        Mean and standard error without the dimension `seed`; NaN where no run (error: fewer than two runs) is left. A
+        NaN of a run that counts is passed on, not skipped.
+    """
+    num = is_finite.sum("seed")
+    mean = values.where(is_finite, 0.0).sum("seed", skipna=False) / num.where(num > 0)
+    deviation = (values - mean).where(is_finite, 0.0)
+    variance = (deviation**2).sum("seed", skipna=False) / (num - 1).where(num > 1)
+    return mean, (variance / num) ** 0.5
+
+
+def summarise(runs: xr.Dataset) -> xr.Dataset:
+    """Mean and standard error over the finite seeds of every figure of `per_run`, with bounds for ANEES.
+
+    The bounds are the two-sided 95 % interval of χ²(n·dof) / (n·dof) for n finite seeds: 2 dof for the position (x, y)
+    and 3 for the pose (x, y, yaw). The frames of a run are correlated, so they add nothing to the degrees of freedom:
+    the interval is that of one frame's average over seeds and therefore cautious for the mean over frames.
+
+    Args:
+        runs: one cell's runs with dimensions (..., seed, frame, feature).
+
+    Returns:
+        Every figure as (statistic, ...) with statistic "mean" and "se"; `anees_position_bounds` and
+        `anees_pose_bounds` as (bound, ...) with bound "lower" and "upper"; `num_runs`, `runs_failed` and
+        `runs_map_full` (runs in which the map was full in some frame) as counts.
+
+    References:
+        Bar-Shalom, Li, Kirubarajan 2001, *Estimation with Applications to Tracking and Navigation*, section 5.4.
+    """
+    figures = per_run(runs)
+    is_finite = figures.is_finite
+    mean, error = mean_and_error(_as_array(figures), is_finite)
+    summary = _statistics({"mean": mean, "se": error})
+    num = is_finite.sum("seed")
+    tails = {"lower": (1 - _CONFIDENCE) / 2, "upper": (1 + _CONFIDENCE) / 2}
+    for name, dof in _DOF.items():
+        dof_total = dof * num.where(num > 0)
+        bounds = {side: xr.apply_ufunc(stats.chi2.ppf, q, dof_total) / dof_total for side, q in tails.items()}
+        summary[f"{name}_bounds"] = xr.concat(list(bounds.values()), xr.Variable("bound", list(bounds)))
+    summary["num_runs"] = xr.ones_like(is_finite, dtype=int).sum("seed")
+    summary["runs_failed"] = (~is_finite).sum("seed")
+    summary["runs_map_full"] = (runs.map_full_frames > 0).sum("seed")
+    return summary
+
+
+def paired_difference(runs_a: xr.Dataset, runs_b: xr.Dataset) -> xr.Dataset:
+    """Mean difference a − b of every figure over the seeds finite in both, with a 95 % Student-t interval.
+
+    The same seed sees the same draws in both, so the noise they share cancels: with d the difference of one seed and n
+    pairs, the interval is mean(d) ± t(0.975, n − 1)·s(d)/√n.
+
+    Args:
+        runs_a: one cell's runs with dimensions (..., seed, frame, feature).
+        runs_b: another's; sweep coordinates are equal to those of `runs_a`.
+
+    Returns:
+        Every figure as (statistic, ...) with statistic "mean", "se", "lower" and "upper", and `num_pairs`.
+
+    Raises:
+        ValueError: if the two have no seed in common.
+    """
+    seeds = np.intersect1d(runs_a.seed.values, runs_b.seed.values)
+    if len(seeds) == 0:
+        raise ValueError(
+            f"paired_difference: runs_a has the seeds {runs_a.seed.values.tolist()} and runs_b "
+            f"{runs_b.seed.values.tolist()}, none in common; run both with the same seeds."
+        )
+    a, b = per_run(runs_a).sel(seed=seeds), per_run(runs_b).sel(seed=seeds)
+    with xr.set_options(arithmetic_join="exact"):
+        is_finite = a.is_finite & b.is_finite
+        mean, error = mean_and_error(_as_array(a) - _as_array(b), is_finite)
+    half_width = error * xr.apply_ufunc(student_t, is_finite.sum("seed"))
+    statistics = {"mean": mean, "se": error, "lower": mean - half_width, "upper": mean + half_width}
+    return _statistics(statistics).assign(num_pairs=is_finite.sum("seed"))
+
+
+def student_t(num: Any) -> Any:
+    """Standard errors on each side of a 95 % interval of a mean over `num` runs: t(0.975, num − 1); NaN below two."""
+    return stats.t.ppf((1 + _CONFIDENCE) / 2, num - 1)
+
+
+def format_mean(name: str, mean: float, error: float) -> str:
+    """`mean ± error` of a figure with its decimals; without the error, or as a dash, where they are not known."""
+    if not math.isfinite(mean):
+        return "–"
+    text = f"{mean:.{DECIMALS[name]}f}"
+    return text + (f" ± {error:.{DECIMALS[name]}f}" if math.isfinite(error) else "")
+
+
+def summary_text(summary: xr.Dataset) -> str:
+    """The result of `summarise` as plain text: a line per figure, or a line per point of a sweep."""
+    sweep = [str(dim) for dim in summary.num_runs.dims]
+    if not sweep:
+        rows = [[label, _figure_text(summary, name)] for name, label in FIGURES.items()]
+        return _columns([*rows, ["runs", runs_text(summary)]])
+    points = summary.stack(point=sweep)
+    rows = [[*sweep, *(FIGURES[name] for name in _SWEPT), "runs"]]
+    for i in range(points.sizes["point"]):
+        point = points.isel(point=i)
+        place = [f"{point[dim].item():.6g}" for dim in sweep]
+        figures = [format_mean(name, *point[name].values) for name in _SWEPT]
+        rows.append([*place, *figures, runs_text(point)])
+    return _columns(rows)
+
+
+def runs_text(summary: xr.Dataset) -> str:
+    """How many runs there were, failed, and met a full map: e.g. "25, 1 failed"."""
+    text = f"{summary.num_runs.item()}, {summary.runs_failed.item()} failed"
+    full = summary.runs_map_full.item()
+    return text + (f", map full in {full}" if full else "")
+
+
+def _figure_text(summary: xr.Dataset, name: str) -> str:
+    text = format_mean(name, *summary[name].values)
+    if f"{name}_bounds" in summary:
+        text += "  (95 % of consistent filters: {:.2f} to {:.2f})".format(*summary[f"{name}_bounds"].values)
+    return text
+
+
+def _columns(rows: list[list[str]]) -> str:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def _rms(error: xr.DataArray) -> xr.DataArray:
+    return (error**2).mean("frame", skipna=False) ** 0.5
+
+
+def _as_array(figures: xr.Dataset) -> xr.DataArray:
+    return figures[list(FIGURES)].to_dataarray("figure")
+
+
+def _statistics(statistics: dict[str, xr.DataArray]) -> xr.Dataset:
+    return xr.concat(list(statistics.values()), xr.Variable("statistic", list(statistics))).to_dataset(dim="figure")
