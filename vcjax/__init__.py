@@ -1,7 +1,7 @@
 """vcjax: which image features belong to moving things, and how should a camera move to find out?
 
-A differentiable, batched EKF visual-SLAM library in JAX around the virtual correction (VC) gate. Importing it computes nothing,
-starts no device and leaves JAX's configuration alone; for the paper's numbers switch float64 on first:
+A differentiable, batched EKF visual-SLAM library in JAX around the virtual correction (VC) gate. Importing it computes
+nothing, starts no device and leaves JAX's configuration alone; for the paper's numbers switch float64 on first:
 `jax.config.update("jax_enable_x64", True)`.
 """
 

@@ -81,7 +81,7 @@ class Run:
     config: FilterConfig
     """The filter."""
     gate: GateName = "VC"
-    """Update gate: RE (re-projection error) or VC (virtual correction). Its own options are listed under gate options."""
+    """Update gate: RE (re-projection error) or VC (virtual correction)."""
     seeds: int = 25
     """Number of runs."""
     key: int = 0

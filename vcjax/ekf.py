@@ -49,9 +49,7 @@ class Correction(NamedTuple):
     """P - K Z Kᵀ. Equation (12)."""
 
 
-def correct(
-    P: Float[Array, "n n"], H: Float[Array, "2 n"], z: Float[Array, "2"], S: Float[Array, "2 2"]
-) -> Correction:
+def correct(P: Float[Array, "n n"], H: Float[Array, "2 n"], z: Float[Array, "2"], S: Float[Array, "2 2"]) -> Correction:
     """Correct a block by one measurement: K = P Hᵀ S⁻¹, shift K z, covariance P - K S Kᵀ. Equations (10)–(12).
 
     With U = W H P (W the whitener of S) these are Uᵀ(W z) and P - Uᵀ U: symmetric by construction.

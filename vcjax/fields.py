@@ -1,9 +1,9 @@
 """Converters for configuration fields: numbers stay traced, bad values are refused before anything compiles.
 
-A Python float is static under `equinox.filter_jit`, so that every new threshold would compile anew. These converters store
-NumPy numbers, which are traced; they start no JAX device, so configurations can be built at import. Values that are already
-JAX arrays (a tracer, a swept batch) pass through unchecked. So does what is no number: a converter knows no name, and
-`require` refuses it by field and value.
+A Python float is static under `equinox.filter_jit`, so that every new threshold would compile anew. These converters
+store NumPy numbers, which are traced; they start no JAX device, so configurations can be built at import. Values that
+are already JAX arrays (a tracer, a swept batch) pass through unchecked. So does what is no number: a converter knows
+no name, and `require` refuses it by field and value.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,8 @@ def require(
         length: how many numbers a vector must have (its last axis); None: any.
 
     Raises:
-        ValueError: if it has another length, any element is no number, NaN or breaks the condition. Of traced values only
+        ValueError: if it has another length, any element is no number, NaN or breaks the condition. Of traced values
+        only
             the length is checked.
     """
     value, owner_name = getattr(owner, name), type(owner).__name__

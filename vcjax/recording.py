@@ -53,7 +53,8 @@ class Recording(eqx.Module):
     is_valid: Bool[AnyArray, "T V"]
     """Whether the entry holds a measured feature."""
     is_last: Bool[AnyArray, "T V"]
-    """Whether the feature is never seen again in this recording (see `last_sightings`); all false where nobody knows."""
+    """Whether the feature is never seen again in this recording (see `last_sightings`); all false where nobody
+    knows."""
     camera: Camera
     """Calibration."""
     robot_start: Float[AnyArray, "7"]
@@ -108,7 +109,8 @@ def validate(recording: Recording) -> None:
     Raises:
         ValueError: naming field, place, value and remedy: shapes that disagree, no frames, times that do not grow, a
             non-finite number where one is needed (pixels count only where valid), negative or repeated ids in a frame,
-            covariances with negative diagonal, quaternions that are not of unit length. Traced recordings are not checked.
+            covariances with negative diagonal, quaternions that are not of unit length. Traced recordings are not
+            checked.
     """
     leaves = jax.tree.leaves(recording)
     if not all(is_concrete(leaf) for leaf in leaves):
@@ -133,14 +135,19 @@ def validate(recording: Recording) -> None:
     for name, shape in shapes.items():
         found = np.shape(getattr(recording, name))
         if found != shape:
-            raise ValueError(f"Recording({name}) has shape {found}, but {shape} is needed (T frames first, from time_s).")
+            raise ValueError(
+                f"Recording({name}) has shape {found}, but {shape} is needed (T frames first, from time_s)."
+            )
     _refuse_types(recording)
     for name in ("time_s", "odometry", "odometry_cov", "sensor_shift_m", "robot_start", "sensor_start", "start_cov"):
         _refuse_where(~np.isfinite(getattr(recording, name)), name, recording, "must be finite.")
 
     is_valid, track_id = np.asarray(recording.is_valid), np.asarray(recording.track_id)
     _refuse_where(
-        is_valid[..., None] & ~np.isfinite(recording.uv_px), "uv_px", recording, "is marked valid; clear is_valid there."
+        is_valid[..., None] & ~np.isfinite(recording.uv_px),
+        "uv_px",
+        recording,
+        "is marked valid; clear is_valid there.",
     )
     _refuse_where(is_valid & (track_id < 0), "track_id", recording, "is marked valid; ids start at 0.")
     _refuse_where(np.diff(recording.time_s, prepend=-np.inf) <= 0, "time_s", recording, "times must grow.")
@@ -156,7 +163,8 @@ def validate(recording: Recording) -> None:
     if len(repeated):
         frame, column = repeated[0]
         raise ValueError(
-            f"Recording(track_id): frame {frame} has id {ordered[frame, column]} twice; keep one measurement per feature."
+            f"Recording(track_id): frame {frame} has id {ordered[frame, column]} twice; "
+            "keep one measurement per feature."
         )
 
 

@@ -1,7 +1,7 @@
 """Filter configuration: static capacities and choices, traced thresholds and noises.
 
-What is static (capacities, choices) compiles anew when changed. What is a number is traced: another value costs nothing, and
-any of them can be swept or differentiated.
+What is static (capacities, choices) compiles anew when changed. What is a number is traced: another value costs
+nothing, and any of them can be swept or differentiated.
 """
 
 from typing import Literal
@@ -43,7 +43,8 @@ class FilterConfig(eqx.Module):
     blacklist_capacity: int = eqx.field(static=True, default=0)
     """How many deleted features are remembered and never born again; 0: a deleted feature may come back."""
     reverse_mode: bool = eqx.field(static=True, default=False)
-    """Make the run differentiable in reverse mode too (a bounded loop over recovered features instead of a free one)."""
+    """Make the run differentiable in reverse mode too (a bounded loop over recovered features instead of a free
+    one)."""
     toolbox_parity: bool = eqx.field(static=True, default=False)
     """Use the scalar shortcut for derivatives of unit vectors, as the paper's toolbox does (see `frames.unit`)."""
 

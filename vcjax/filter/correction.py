@@ -209,12 +209,16 @@ def _move(config: FilterConfig, submap: Submap, shift: Float[Array, " n"]) -> Su
 
 
 def _settle(
-    config: FilterConfig, vehicle_before: Float[Array, "14"], submap: Submap, j: int | Int[Array, ""], is_used: Bool[Array, ""]
+    config: FilterConfig,
+    vehicle_before: Float[Array, "14"],
+    submap: Submap,
+    j: int | Int[Array, ""],
+    is_used: Bool[Array, ""],
 ) -> Submap:
-    """After its correction: keep the inverse depth of landmark j positive, and make it Euclidean once it is near linear.
+    """After its correction: keep landmark j's inverse depth positive, and make it Euclidean once it is near linear.
 
-    The linearity index is taken with the landmark after its correction and the camera pose from before it, as the paper's
-    toolbox does. The conversion leaves P alone (see `filter.state`).
+    The linearity index is taken with the landmark after its correction and the camera pose from before it, as the
+    paper's toolbox does. The conversion leaves P alone (see `filter.state`).
     """
     landmark, T = submap.landmarks[j], submap.to_coordinates[j]
     rho = landmark[INVERSE_DEPTH]

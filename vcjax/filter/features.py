@@ -48,7 +48,7 @@ def observe(config: FilterConfig, camera: Camera, block: Block) -> Observation:
 
 
 def retract(config: FilterConfig, block: Block, shift: Float[Array, "21"]) -> Block:
-    """A block moved by a correction: x + K z (11); an inverse depth that became negative is set to a small positive one."""
+    """A block moved by a correction, x + K z (11). An inverse depth that is not positive is set to a small one."""
     landmark = block.landmark + block.to_coordinates @ shift[VEHICLE:]
     rho = landmark[INVERSE_DEPTH]
     landmark = landmark.at[INVERSE_DEPTH].set(jnp.where(rho > 0, rho, config.inverse_depth_min))

@@ -36,8 +36,8 @@ def give_birth(
 ) -> tuple[FilterState, Int[Array, " births"], Bool[Array, ""]]:
     """Initialise up to `num_births` new landmarks from features that are not in the map. Paper's Table 1.
 
-    Eligible are measured features at least `birth_margin_px` inside the image and not on the blacklist; lowest id first, or
-    in random order.
+    Eligible are measured features at least `birth_margin_px` inside the image and not on the blacklist; lowest id
+    first, or in random order.
 
     Args:
         config: priors, margin and order.

@@ -1,8 +1,8 @@
 """EKF-SLAM: `start` for the first frame, `step` for every other, `run` for a whole recording.
 
-One frame, in order: prediction (6) (7); every landmark's pixel predicted; the K most uncertain visible ones chosen; formal
-corrections (8)–(12), the gate's verdict (13) (14), corrections with the recovered; deletion of what gate or detector
-flagged; retirement of what will not be seen again; births.
+One frame, in order: prediction (6) (7); every landmark's pixel predicted; the K most uncertain visible ones chosen;
+formal corrections (8)–(12), the gate's verdict (13) (14), corrections with the recovered; deletion of what gate or
+detector flagged; retirement of what will not be seen again; births.
 """
 
 import equinox as eqx
@@ -82,8 +82,8 @@ def predict(config: FilterConfig, state: FilterState, frame: Frame) -> FilterSta
 def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[FilterState, FrameInfo]:
     """One frame of EKF-SLAM.
 
-    Pure; works under `jit`, `vmap`, `scan` and differentiation (exact derivatives of all that is continuous; choices and
-    verdicts have zero derivative). Raises nothing: look at `is_finite` and `map_is_full`.
+    Pure; works under `jit`, `vmap`, `scan` and differentiation (exact derivatives of all that is continuous; choices
+    and verdicts have zero derivative). Raises nothing: look at `is_finite` and `map_is_full`.
 
     Args:
         config: filter configuration.
@@ -140,9 +140,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     return _finish(config, state, frame, is_mapped, config.births_per_frame, info_of_candidates)
 
 
-def start(
-    config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None
-) -> tuple[FilterState, FrameInfo]:
+def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None) -> tuple[FilterState, FrameInfo]:
     """The first frame of a recording: its odometry, and the first births into the empty map.
 
     Args:
@@ -203,9 +201,7 @@ def _finish(
     return state, info
 
 
-def run(
-    config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None
-) -> tuple[FilterState, FrameInfo]:
+def run(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None) -> tuple[FilterState, FrameInfo]:
     """Filter a whole recording.
 
     Args:

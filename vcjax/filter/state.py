@@ -1,13 +1,13 @@
 """FilterState: what the next frame needs, and nothing else.
 
-The map has a fixed number L of slots of seven error coordinates each, whatever it holds. P is kept as the three blocks of
-paper equation (3): vehicle (robot and sensor) with itself, vehicle with slots, slots with slots. Prediction, the
+The map has a fixed number L of slots of seven error coordinates each, whatever it holds. P is kept as the three blocks
+of paper equation (3): vehicle (robot and sensor) with itself, vehicle with slots, slots with slots. Prediction, the
 normalisation of quaternions and much of a correction touch the first two only, which are small.
 
-A slot keeps the seven AHP error coordinates it was born with for life. When its landmark becomes Euclidean, p = f(x_AHP),
-only the mean changes its form; P keeps its seven rows and `to_coordinates` keeps J = ∂f/∂x_AHP, frozen at that moment. As
-Kalman updates are linear in the error, using H J with the old rows gives, ever after, exactly the numbers that P's rows
-transformed by J would give, and no pass over P is needed.
+A slot keeps the seven AHP error coordinates it was born with for life. When its landmark becomes Euclidean, p =
+f(x_AHP), only the mean changes its form; P keeps its seven rows and `to_coordinates` keeps J = ∂f/∂x_AHP, frozen at
+that moment. As Kalman updates are linear in the error, using H J with the old rows gives, ever after, exactly the
+numbers that P's rows transformed by J would give, and no pass over P is needed.
 
 A free slot's rows hold whatever they held before: the numbers of a landmark that is never looked at again. They are as
 inert as zeros would be, and cost nothing to leave. The last slot is a spare: always free, it takes the writes of births

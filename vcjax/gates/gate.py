@@ -1,8 +1,8 @@
 """The two contracts of feature rejection: an update gate and a detector.
 
-A **gate** decides within one frame which measurements correct the state: it accepts a candidate by its RE₁, and passes a
-verdict on those it did not accept, each with its own 21-block of robot, sensor and landmark. A **detector** watches landmark
-slots over many frames, keeps a state for each, and flags the ones to delete. The two combine freely.
+A **gate** decides within one frame which measurements correct the state: it accepts a candidate by its RE₁, and passes
+a verdict on those it did not accept, each with its own 21-block of robot, sensor and landmark. A **detector** watches
+landmark slots over many frames, keeps a state for each, and flags the ones to delete. The two combine freely.
 
 A new gate or detector is one new file with one small class. All methods are pure, masked and batched; what is not a
 candidate must neither change a result nor a gradient.
@@ -47,8 +47,8 @@ class Candidates(eqx.Module):
 def harmless(candidates: Candidates) -> Candidates:
     """The candidates, with those that are not to be judged replaced by numbers without effect: mean 1, P 0, pixel 0.
 
-    A masked candidate may hold anything, NaN included. Replaced before anything is computed, it leaves the derivatives by what
-    all candidates share finite. The mean is of ones because zeros are neither a quaternion nor a depth.
+    A masked candidate may hold anything, NaN included. Replaced before anything is computed, it leaves the derivatives
+    by what all candidates share finite. The mean is of ones because zeros are neither a quaternion nor a depth.
     """
 
     def replace(leaf, number):
@@ -83,8 +83,9 @@ class AbstractGate(eqx.Module):
     """Update gate: accept, recover or call dynamic."""
 
     prior: eqx.AbstractVar[Prior]
-    """Where isolated candidates are judged: "corrected", after all formal corrections of the frame, with RE₁ < Th₁ tested
-    at the running state; or "predicted", with both at the state after prediction, as equation (13) is printed."""
+    """Where isolated candidates are judged: "corrected", after all formal corrections of the frame, with RE₁ < Th₁
+    tested at the running state; or "predicted", with both at the state after prediction, as equation (13) is
+    printed."""
 
     @abstractmethod
     def accepts(self, re1: Float[Array, "..."]) -> Bool[Array, "..."]:
@@ -122,4 +123,3 @@ class AbstractDetector(eqx.Module):
     @abstractmethod
     def observe(self, state: PyTree, evidence: Evidence) -> tuple[PyTree, Bool[Array, " L"]]:
         """New state (leading axis L) and the slots whose landmark is to be deleted."""
-

@@ -21,8 +21,8 @@ class Counts(NamedTuple):
 class InlierRatio(AbstractDetector):
     """Flag a visible landmark, searched at least `min_searches` times, that was found or fitted too seldom.
 
-    Flagged when measured/searched < `min_measured_ratio` or corrected/measured < `min_corrected_ratio`. All counts start at
-    one. Its decisions have zero derivative.
+    Flagged when measured/searched < `min_measured_ratio` or corrected/measured < `min_corrected_ratio`. All counts
+    start at one. Its decisions have zero derivative.
     """
 
     min_searches: float = eqx.field(converter=number, default=10.0)
@@ -33,7 +33,9 @@ class InlierRatio(AbstractDetector):
     """Smallest share of finds that are used in a correction, in [0, 1]."""
 
     def __check_init__(self):
-        require(self, "min_searches", lambda n: n >= 0, "give a number of searches, or infinity to switch the rule off.")
+        require(
+            self, "min_searches", lambda n: n >= 0, "give a number of searches, or infinity to switch the rule off."
+        )
         for ratio in ("min_measured_ratio", "min_corrected_ratio"):
             require(self, ratio, lambda r: (r >= 0) & (r <= 1), "a ratio lies in [0, 1].")
 

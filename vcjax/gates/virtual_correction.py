@@ -1,17 +1,18 @@
 """VC: the paper's virtual correction, equations (13) and (14).
 
-An isolated candidate corrects a virtual copy of the state. RE₁ is its error before, RE₂ after. If the error falls by more
-than Th₂ the feature is called dynamic, else it is recovered. The copy needs only the 21 × 21 block of robot, sensor and
-that landmark: nothing else enters the candidate's projection, so the block's correction is the full one's, exactly.
+An isolated candidate corrects a virtual copy of the state. RE₁ is its error before, RE₂ after. If the error falls by
+more than Th₂ the feature is called dynamic, else it is recovered. The copy needs only the 21 × 21 block of robot,
+sensor and that landmark: nothing else enters the candidate's projection, so the block's correction is the full one's,
+exactly.
 
 What the test can and cannot tell: where projection is linear and the prior covariance of the projection is E = H P Hᵀ,
 Z = E + R, the virtual correction leaves the residual z⁺ = R Z⁻¹ z and H P⁺ Hᵀ = R - R Z⁻¹ R, so that
 
     RE₂ = zᵀ (Z + 2 Z R⁻¹ E)⁻¹ z,      RE₁ - RE₂ = Σᵢ (uᵢᵀz)²/sᵢ · (2λᵢ - 2)/(2λᵢ - 1)
 
-for R = r I and Z with eigenvectors uᵢ and eigenvalues sᵢ = λᵢ r. A well-mapped feature (λ → 1) is always recovered, however
-large its error; an uncertain one (λ ≫ 1) is called dynamic when RE₁ exceeds max(Th₁, Th₂). At one state VC deletes a subset
-of what RE rejects.
+for R = r I and Z with eigenvectors uᵢ and eigenvalues sᵢ = λᵢ r. A well-mapped feature (λ → 1) is always recovered,
+however large its error; an uncertain one (λ ≫ 1) is called dynamic when RE₁ exceeds max(Th₁, Th₂). At one state VC
+deletes a subset of what RE rejects.
 """
 
 import equinox as eqx
@@ -70,8 +71,8 @@ def virtual_correction(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """RE₁ before and RE₂ after correcting a copy of a block with its own measurement. Equations (8)–(14).
 
-    W of equation (14) is R + H P⁺ Hᵀ as printed. (The residual's true covariance is R - H P⁺ Hᵀ; with it RE₂ would equal
-    RE₁ and the test would be void.) Derivative exact.
+    W of equation (14) is R + H P⁺ Hᵀ as printed. (The residual's true covariance is R - H P⁺ Hᵀ; with it RE₂ would
+    equal RE₁ and the test would be void.) Derivative exact.
     """
     e_hat, H = model.observe(mean)
     z = uv_px - e_hat
@@ -80,5 +81,3 @@ def virtual_correction(
     e, H_plus = model.observe(model.retract(mean, virtual.shift))
     W = innovation_cov(H_plus, virtual.P, R)
     return mahalanobis(z, Z), mahalanobis(uv_px - e, W)
-
-

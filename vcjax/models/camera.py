@@ -67,7 +67,8 @@ def _scale(camera: Camera, radius2: Float[Array, ""]) -> tuple[Float[Array, ""],
 def project(camera: Camera, point_c: Float[Array, "3"]) -> Pixel:
     """Pixel of a point in camera coordinates. A point in the camera's own plane (v_z = 0) gives a finite dummy pixel.
 
-    Derivative exact for v_z ≠ 0. Only the direction of `point_c` matters; whether it lies in front is the caller's test.
+    Derivative exact for v_z ≠ 0. Only the direction of `point_c` matters; whether it lies in front is the caller's
+    test.
     """
     return pixel_jacobian(camera, point_c)[0]
 
@@ -110,4 +111,3 @@ def is_inside(camera: Camera, pixel: Float[Array, "... 2"], margin_px: float | A
     """Whether a pixel lies in [0, width] × [0, height], at least `margin_px` from every border (bounds included)."""
     size = jnp.asarray(camera.image_size_px)
     return jnp.all((pixel >= margin_px) & (pixel <= size - margin_px), axis=-1)
-

@@ -1,10 +1,10 @@
 """Quaternions and rigid frames.
 
-Quaternions are Hamilton, ordered (w, x, y, z). A frame (or pose) is the 7-vector [t, q] that maps its own coordinates to
-its parent's, p_parent = R(q) p + t. A pose named `T_w_r` takes robot coordinates to world coordinates.
+Quaternions are Hamilton, ordered (w, x, y, z). A frame (or pose) is the 7-vector [t, q] that maps its own coordinates
+to its parent's, p_parent = R(q) p + t. A pose named `T_w_r` takes robot coordinates to world coordinates.
 
-`rotation_matrix` is the homogeneous quadratic form of q: it is a rotation only for unit q, and its plain derivative is a
-polynomial. Whoever holds a quaternion that may have drifted from unit length passes it through `unit` first.
+`rotation_matrix` is the homogeneous quadratic form of q: it is a rotation only for unit q, and its plain derivative is
+a polynomial. Whoever holds a quaternion that may have drifted from unit length passes it through `unit` first.
 """
 
 import jax
@@ -81,7 +81,7 @@ def quaternion_conjugate(q: Quaternion) -> Quaternion:
 
 
 def quaternion_from_rotation_vector(v: Vector3) -> Quaternion:
-    """[cos(|v|/2), v sin(|v|/2)/|v|] for a rotation vector in rad; its Taylor series [1 - |v|²/8, v/2] below 1e-6 rad."""
+    """[cos(|v|/2), v sin(|v|/2)/|v|] of a rotation vector in rad; below 1e-6 rad its series [1 - |v|²/8, v/2]."""
     angle2 = jnp.sum(v * v)
     is_small = angle2 < SMALL_ANGLE_RAD**2
     # The branch not taken is fed a harmless angle: a square root of zero would put NaN into the derivative.

@@ -1,7 +1,7 @@
 """Point landmarks: anchored homogeneous (AHP) and Euclidean, in one form.
 
-An AHP landmark is the 7-vector [p₀ anchor, m direction, ρ inverse depth] of the point p₀ + m/ρ. Seen from robot pose r and
-sensor pose s (camera centre c = R_r t_s + t_r, rotation R_c = R_r R_s) its homogeneous camera coordinates are
+An AHP landmark is the 7-vector [p₀ anchor, m direction, ρ inverse depth] of the point p₀ + m/ρ. Seen from robot pose r
+and sensor pose s (camera centre c = R_r t_s + t_r, rotation R_c = R_r R_s) its homogeneous camera coordinates are
 
     v = R_cᵀ (m + ρ (p₀ - c)).
 
@@ -93,11 +93,11 @@ def back_project_landmark(
 def linearity_index(
     robot: Pose, sensor: Pose, landmark: Landmark, inverse_depth_std: float | Array
 ) -> Float[Array, ""]:
-    """How far from linear the inverse depth still is, L = 4 (σ_d/d₁) |cos α|; below 0.1 a Euclidean point serves as well.
+    """How far from linear the inverse depth still is, L = 4 (σ_d/d₁) |cos α|.
 
-    σ_d = σ_ρ/ρ² is the depth's standard deviation, d₁ the distance from the camera to the point and α the angle there
-    between the direction of the anchor's ray and the present one. Source: Civera, Davison & Montiel 2008, in the form of the
-    paper's toolbox. Derivative exact.
+    Below 0.1 a Euclidean point serves as well. σ_d = σ_ρ/ρ² is the depth's standard deviation, d₁ the distance from the
+    camera to the point, and α the angle there between the direction of the anchor's ray and the present one. Source:
+    Civera, Davison & Montiel 2008, in the form of the paper's toolbox. Derivative exact.
     """
     rho = landmark[INVERSE_DEPTH]
     to_landmark = to_point(landmark) - camera_centre(robot, sensor)

@@ -36,7 +36,8 @@ def move_by_constant_velocity(
         impulse: random change of the twist in this step, same units.
         time_step_s: Δt, s.
 
-    Returns: pose and twist at the end of the step. The impulse acts at its end, as in the paper's toolbox. Derivative exact.
+    Returns: pose and twist at the end of the step. The impulse acts at its end, as in the paper's toolbox. Derivative
+    exact.
     """
     q = quaternion_product(pose[3:], quaternion_from_rotation_vector(twist[3:] * time_step_s))
     return jnp.concatenate([pose[:3] + twist[:3] * time_step_s, q]), twist + impulse
@@ -51,7 +52,12 @@ class Oscillation(eqx.Module):
     """f, Hz; below half the frame rate."""
 
     def __check_init__(self):
-        require(self, "amplitude_m", lambda a: np.isfinite(a) & (a >= 0), "the amplitude is a length, 0 for a steady camera.")
+        require(
+            self,
+            "amplitude_m",
+            lambda a: np.isfinite(a) & (a >= 0),
+            "the amplitude is a length, 0 for a steady camera.",
+        )
         require(self, "frequency_hz", lambda f: np.isfinite(f) & (f >= 0), "the frequency must not be negative.")
 
 

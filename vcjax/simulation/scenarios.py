@@ -75,8 +75,8 @@ class Scenario(eqx.Module):
         rate, frequency = self.frame_rate_hz, self.oscillation.frequency_hz
         if is_concrete(rate) and is_concrete(frequency) and np.any(np.asarray(frequency) >= np.asarray(rate) / 2):
             raise ValueError(
-                f"Scenario(oscillation.frequency_hz={np.asarray(frequency).tolist()}) is at or above half the frame rate "
-                f"({np.asarray(rate).tolist()} Hz); choose a lower frequency or a higher rate."
+                f"Scenario(oscillation.frequency_hz={np.asarray(frequency).tolist()}) is at or above "
+                f"half the frame rate ({np.asarray(rate).tolist()} Hz); choose a lower frequency or a higher rate."
             )
 
 
@@ -96,7 +96,8 @@ def paper(
     """One of the paper's experiments (section 4, Table 1).
 
     Args:
-        robot: forward along x from (-8, 0); curved by 0.5° per frame from (-8, -8); or lateral along y, looking along x,
+        robot: forward along x from (-8, 0); curved by 0.5° per frame from (-8, -8); or lateral along y, looking along
+        x,
             from (-4, -4).
         dynamic: None for a static scene, or how the dynamic features move: lateral (+y) or inverse forward (-x).
         dynamic_speed_m_s: their speed, m/s, at least 0.

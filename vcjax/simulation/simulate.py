@@ -1,8 +1,8 @@
 """Simulate: a scenario and a key give a Recording and its Truth.
 
-The true path is free of noise; the odometry that the filter is given has it, and so have the pixels. Every random number
-is drawn for every frame and every feature, seen or not, in a fixed order: the same key gives the same draws whatever
-gate, camera motion or mover is compared (common random numbers).
+The true path is free of noise; the odometry that the filter is given has it, and so have the pixels. Every random
+number is drawn for every frame and every feature, seen or not, in a fixed order: the same key gives the same draws
+whatever gate, camera motion or mover is compared (common random numbers).
 """
 
 import jax
@@ -20,12 +20,13 @@ from vcjax.simulation.world import velocities
 def simulate(scenario: Scenario, key: PRNGKeyArray) -> tuple[Recording, Truth]:
     """One run of a scenario.
 
-    Frame t = 1 … T is taken at time t/rate, after t increments of the robot; the camera's displacement starts from zero at
-    time 0, and movers move from time 0 on. A feature is observed when its noisy pixel is inside the image and it lies in
-    front of the camera.
+    Frame t = 1 … T is taken at time t/rate, after t increments of the robot; the camera's displacement starts from
+    zero at time 0, and movers move from time 0 on. A feature is observed when its noisy pixel is inside the image and
+    it lies in front of the camera.
 
     Args:
-        scenario: the experiment; any of its numbers may be traced or differentiated (what is observed has zero derivative).
+        scenario: the experiment; any of its numbers may be traced or differentiated (what is observed has zero
+        derivative).
         key: of the run's noise.
 
     Returns: the recording, with one column for each feature of the world, and the truth.

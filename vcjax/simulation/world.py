@@ -32,7 +32,9 @@ class Movers(eqx.Module):
 
     def __check_init__(self):
         require(self, "direction", np.isfinite, "give finite numbers.", length=3)
-        require(self, "speed_m_s", lambda v: np.isfinite(v) & (v >= 0), "a speed is at least 0; turn the direction round.")
+        require(
+            self, "speed_m_s", lambda v: np.isfinite(v) & (v >= 0), "a speed is at least 0; turn the direction round."
+        )
 
 
 def velocities(movers: Movers, num_features: int) -> Float[Array, "F 3"]:

@@ -39,9 +39,9 @@ def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
 def trajectory_errors(info: FrameInfo, truth: Truth) -> dict[str, Float[Array, " T"]]:
     """Errors of the robot pose in each frame and their normalised squares.
 
-    `position_error_m` is √(ex² + ey²); `orientation_error_deg` the angle between the true and the estimated orientation;
-    `yaw_error_deg` the absolute error of the yaw angle. `nees_position` = eᵀ P⁻¹ e of (x, y), 2 degrees of freedom, and
-    `nees_pose` of (x, y, yaw), 3: in a consistent filter their means are 2 and 3.
+    `position_error_m` is √(ex² + ey²); `orientation_error_deg` the angle between the true and the estimated
+    orientation; `yaw_error_deg` the absolute error of the yaw angle. `nees_position` = eᵀ P⁻¹ e of (x, y), 2 degrees
+    of freedom, and `nees_pose` of (x, y, yaw), 3: in a consistent filter their means are 2 and 3.
     """
     robot, cov = info.vehicle[:, :7], info.vehicle_cov[:, :7, :7]
     error_xy = robot[:, :2] - truth.robot[:, :2]

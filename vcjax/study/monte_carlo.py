@@ -1,7 +1,7 @@
 """Monte Carlo in one call: all seeds, and all points of a sweep, as one compiled batch.
 
-A **lane** is one run: one seed at one point of the sweep. Lanes are split over the devices; each device works through its
-part in small batches. On a CPU a batch is a single lane, so that the lane's covariance stays in cache; on an
+A **lane** is one run: one seed at one point of the sweep. Lanes are split over the devices; each device works through
+its part in small batches. On a CPU a batch is a single lane, so that the lane's covariance stays in cache; on an
 accelerator it is all of them. A lane's result depends on its seed number and its numbers only, not on how lanes are
 grouped.
 """
@@ -28,7 +28,6 @@ MAX_LANES_PER_CALL = 256
 """Lanes in one compiled call: what is finished between two reports of progress, and a bound on memory."""
 
 
-
 def monte_carlo(
     scenario: Scenario,
     config: FilterConfig | None = None,
@@ -51,7 +50,8 @@ def monte_carlo(
         num_seeds: number of runs for each point of the sweep, at least 1.
         key: base key, e.g. `jax.random.key(0)`.
         first_seed: number of the first seed; seeds are `first_seed … first_seed + num_seeds - 1`.
-        sweep: path of a numeric leaf → values, e.g. `{"config.gate.th1": [6, 9, 12], "scenario.oscillation.amplitude_m":
+        sweep: path of a numeric leaf → values, e.g. `{"config.gate.th1": [6, 9, 12],
+        "scenario.oscillation.amplitude_m":
             [0, 0.05]}`; several paths span a grid.
         devices: devices to use; all local ones if None.
         progress: called with (lanes done, lanes in all).
@@ -141,5 +141,3 @@ def run_one(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Array]:
     birth_key = jax.random.fold_in(key, 1) if experiment.config.birth_order == "random" else None
     _, info = run(experiment.config, recording, birth_key)
     return run_metrics(info, truth)
-
-

@@ -1,7 +1,8 @@
 """The paper's experiments, all cells, with every finished piece on disk.
 
-A directory holds, for each cell of Tables 2–5, blocks of `SEEDS_PER_BLOCK` seeds: `runs/<cell>/seeds_00000-00024.nc`. What is
-there is not run again, so a run that was stopped goes on where it was, and a larger number of seeds extends a smaller one.
+A directory holds, for each cell of Tables 2–5, blocks of `SEEDS_PER_BLOCK` seeds: `runs/<cell>/seeds_00000-00024.nc`.
+What is there is not run again, so a run that was stopped goes on where it was, and a larger number of seeds extends a
+smaller one.
 """
 
 import json
@@ -102,7 +103,9 @@ def load_results(
     shared = set.intersection(*(set(runs.seed.values.tolist()) for runs in results.values()))
     seeds = sorted(seed for seed in shared if num_seeds is None or seed < num_seeds)
     if not seeds:
-        raise ValueError(f"{directory}: the cells have no seed in common; run `vcjax reproduce` again to complete them.")
+        raise ValueError(
+            f"{directory}: the cells have no seed in common; run `vcjax reproduce` again to complete them."
+        )
     return {cell: runs.sel(seed=seeds) for cell, runs in results.items()}
 
 

@@ -76,7 +76,11 @@ def as_dataset(
         truth = _truth(experiment.scenario)
         data["robot_true"] = (("frame", "pose"), np.asarray(truth.robot), {"long_name": "true robot pose"})
         data["sensor_true"] = (("frame", "pose"), np.asarray(truth.sensor), {"long_name": "true sensor pose"})
-        data["landmark_true"] = (("frame", "feature", "axis"), np.asarray(truth.landmarks_m), {"long_name": "features, m"})
+        data["landmark_true"] = (
+            ("frame", "feature", "axis"),
+            np.asarray(truth.landmarks_m),
+            {"long_name": "features, m"},
+        )
     coordinates = {
         **{path: ((path,), values) for path, values in swept.items()},
         "seed": seeds,

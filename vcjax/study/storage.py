@@ -11,8 +11,8 @@ from pathlib import Path
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """A temporary path to write to, which becomes `path` when the block ends; folders are made as needed.
 
-    If the block fails, what was at `path` before stays, and the temporary file goes. Leftovers of a process that was killed
-    while writing the same file are removed.
+    If the block fails, what was at `path` before stays, and the temporary file goes. Leftovers of a process that was
+    killed while writing the same file are removed.
 
     Raises:
         OSError: if the place cannot be written.

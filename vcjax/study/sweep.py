@@ -22,7 +22,7 @@ class Experiment(eqx.Module):
 
 
 def replace_at(tree: Any, path: str, value: Any) -> Any:
-    """A copy of nested configuration objects with the leaf at `path` replaced. Every object on the way is checked anew."""
+    """A copy of nested configuration objects with the leaf at `path` replaced; all objects on the way are checked."""
     name, _, rest = path.partition(".")
     return dataclasses.replace(tree, **{name: replace_at(getattr(tree, name), rest, value) if rest else value})
 
@@ -41,7 +41,8 @@ def check_sweep(experiment: Experiment, sweep: Sweep) -> dict[str, np.ndarray]:
     """The swept values as arrays.
 
     Raises:
-        ValueError: for an unknown path (the message lists those there are), an empty or nested list of values, or a value
+        ValueError: for an unknown path (the message lists those there are), an empty or nested list of values, or a
+        value
             that the object it belongs to refuses.
     """
     known = list(numeric_paths(experiment))
