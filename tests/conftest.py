@@ -6,18 +6,26 @@ from pathlib import Path
 
 import hypothesis
 import jax
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 jax.config.update("jax_enable_x64", True)
 
-# Checks every call of the package against its annotations; while tracing, so that compiled code pays nothing. It must be
-# set up before the package is imported anywhere.
-install_import_hook("vcjax", "beartype.beartype")
+# Checks every call of the package against its annotations; while tracing, so that compiled code pays nothing. It must
+# be set up before the package is imported anywhere.
+jaxtyping.install_import_hook("vcjax", "beartype.beartype")
 
 # The same examples in every run. Their time is mostly compilation, which the first of them pays: no deadline.
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=60)
 hypothesis.settings.load_profile("repeatable")
+
+
+@pytest.fixture
+def unchecked():
+    """Run-time checks off, as users have it: bad input meets the package's own refusals."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

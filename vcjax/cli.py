@@ -1,14 +1,18 @@
 """The `vcjax` command. Its options are made from the configuration classes by tyro."""
 
+import contextlib
 import dataclasses
+import io
 import os
+import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
 import tyro
+from jaxtyping import PRNGKeyArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -19,6 +23,7 @@ from vcjax.simulation.scenarios import Scenario, paper
 from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.reproduce import GATES, load_results, reproduce
 from vcjax.study.results import save
+from vcjax.study.storage import check_writable
 from vcjax.study.summary import summarise, summary_text
 
 GateName = Literal["RE", "VC"]
@@ -44,18 +49,13 @@ class Reproduce:
 
     def __call__(self, console: Console) -> None:
         """Run, then report."""
-        with _progress(console) as bar:
-            task = bar.add_task("compiling, first cell", total=None)
-
-            def advance(done, total, cell):
-                bar.update(task, completed=done, total=total, description=cell.identifier)
-
+        with _progress(console, "compiling, first cell") as show:
             results = reproduce(
                 self.out,
                 num_seeds=self.seeds,
                 tables=self.tables,
-                key=jax.random.key(self.key),
-                progress=advance,
+                key=_key(self.key),
+                progress=lambda done, total, cell: show(done, total, cell.identifier),
             )
         _report(results, self.out, console)
 
@@ -93,23 +93,18 @@ class Run:
 
     def __call__(self, console: Console) -> None:
         """Run, summarise, save."""
-        with _progress(console) as bar:
-            task = bar.add_task("running", total=None)
-
-            def advance(done, total):
-                bar.update(task, completed=done, total=total)
-
-            runs = monte_carlo(
-                self.scenario, self.config, num_seeds=self.seeds, key=jax.random.key(self.key), progress=advance
-            )
+        check_writable(self.out)
+        with _progress(console, "running") as show:
+            runs = monte_carlo(self.scenario, self.config, num_seeds=self.seeds, key=_key(self.key), progress=show)
         print(summary_text(summarise(runs)))
-        console.print(f"wrote {save(runs, self.out)}")
+        _say(console, f"wrote {save(runs, self.out)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the `vcjax` command; returns its exit status.
 
-    Bad input gives one line on standard error and status 1, not a traceback; a wrong command line gives status 2.
+    Bad input gives one line on standard error, not a traceback: status 2 where it is refused with the command line,
+    else 1.
     """
     console = Console(stderr=True)
     arguments = list(sys.argv[1:] if arguments is None else arguments)
@@ -117,13 +112,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = _parse(arguments)
         _use_cores(getattr(command, "devices", None))
         command(console)
+    except _UsageError as error:
+        _say(console, f"vcjax: {error}", style="bold red")
+        return 2
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        console.print(f"vcjax: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+        _say(console, f"vcjax: {error}", style="bold red")
         return 1
     except KeyboardInterrupt:
-        console.print("vcjax: stopped; what is finished is on disk.", markup=False)
+        _say(console, "vcjax: stopped; what `vcjax reproduce` has finished is on disk, and it will go on from there.")
         return 130
     return 0
+
+
+class _UsageError(Exception):
+    """A command line that cannot be understood, or names values that are refused."""
 
 
 def _parse(arguments: list[str]) -> Reproduce | Report | Run:
@@ -135,45 +137,119 @@ def _parse(arguments: list[str]) -> Reproduce | Report | Run:
         | Annotated[Report, tyro.conf.subcommand("report")]
         | Annotated[Run, tyro.conf.subcommand("run", default=default)]
     )
-    return tyro.cli(
-        union,  # type: ignore[arg-type]
-        args=arguments,
-        prog="vcjax",
-        description="Which image features belong to moving things, and how should a camera move to find out?",
-        config=(tyro.conf.OmitArgPrefixes,),
-    )
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(
+                union,  # type: ignore[arg-type]
+                args=arguments,
+                prog="vcjax",
+                description="Which image features belong to moving things, and how should a camera move to find out?",
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
+    except SystemExit as stop:
+        if not stop.code:  # --help
+            raise
+        about = next((f" {name}" for name in arguments[:1] if name in ("reproduce", "report", "run")), "")
+        raise _UsageError(f"{_one_line(complaint.getvalue())} (see vcjax{about} --help)") from None
+
+
+def _one_line(box: str) -> str:
+    """What the parser says in a box, as one line.
+
+    The box has a title and parts with a rule between them: what is wrong, then what may have been meant, with options
+    at the beginning of lines, and where there is help.
+    """
+    parts: list[list[str]] = [[]]
+    for line in box.splitlines():
+        text = line.strip("│╭╮╰╯─ ")
+        if text:
+            parts[-1].append(text)
+        else:
+            parts.append([])
+    title, *wrong = parts[0]
+    message = " ".join(wrong or [title])
+    message = re.sub(r"^Error parsing (?!--)\S+: ", "", message)  # a name of the parser's own
+    meant = [
+        text.split()[0]
+        for part in parts
+        if part[:1] == ["Perhaps you meant:"]
+        for text in part
+        if text.startswith("--")
+    ]
+    return f"{message}; perhaps {' or '.join(meant)}?" if meant else message
 
 
 def _gate_name(arguments: list[str]) -> str:
-    """The value of `--gate`; the default where there is none, or one that the parser will refuse."""
-    for option, value in zip(arguments, [*arguments[1:], ""], strict=True):
-        name = value if option == "--gate" else option.removeprefix("--gate=") if option.startswith("--gate=") else None
-        if name in GATES:
-            return name
-    return "VC"
+    """The last value of `--gate`; the default where there is none, or one that the parser will refuse."""
+    gate = "VC"
+    for option, value in zip(arguments, [*arguments, ""][1:], strict=True):
+        name = value if option == "--gate" else option.removeprefix("--gate=") if option.startswith("--gate=") else ""
+        gate = name if name in GATES else gate
+    return gate
 
 
 def _use_cores(num_devices: int | None) -> None:
-    """Float64, and as many CPU devices as there are cores: the seeds are shared between them."""
+    """Float64, and as many CPU devices as there are cores: the seeds are shared between them.
+
+    Raises:
+        ValueError: for a number of devices that cannot be had.
+    """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if num_devices is not None and num_devices < 1:
         raise ValueError(f"--devices {num_devices}: give at least one device.")
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_num_cpu_devices", num_devices or cores)
+    try:
+        jax.config.update("jax_num_cpu_devices", num_devices or cores)
+    except RuntimeError:  # called from a program in which JAX is at work already: its devices are what there is
+        present = jax.local_device_count()
+        if num_devices not in (None, present):
+            raise ValueError(f"--devices {num_devices}: JAX already runs in this process, with {present}.") from None
 
 
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
+def _key(number: int) -> PRNGKeyArray:
+    """The random key of a number.
+
+    Raises:
+        ValueError: if it has more than 64 bits.
+    """
+    if not -(2**63) <= number < 2**63:
+        raise ValueError(f"--key {number}: give a whole number of at most 64 bits.")
+    return jax.random.key(number)
+
+
+@contextlib.contextmanager
+def _progress(console: Console, description: str) -> Iterator[Callable[..., None]]:
+    """A progress bar; gives a function of (done, total) or (done, total, description) that moves it.
+
+    When the work is refused, the bar goes, so that what is wrong stands alone.
+    """
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    bar = Progress(TextColumn("{task.description}"), *columns, console=console)
+    task = bar.add_task(description, total=None)
+
+    def show(done: int, total: int, description: str | None = None) -> None:
+        bar.update(task, completed=done, total=total, description=description)
+
+    bar.start()
+    try:
+        yield show
+    except Exception:
+        bar.live.transient = True
+        bar.live.stop()
+        raise
+    except BaseException:
+        bar.stop()
+        raise
+    bar.stop()
+
+
+def _say(console: Console, text: str, style: str | None = None) -> None:
+    """Print a line as it is, without markup and never broken."""
+    console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
 
 def _report(results, directory: Path, console: Console) -> None:
     """Write tables and figures and say where."""
     for path in (*write_tables(results, directory), *write_figures(results, directory)):
-        console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+        _say(console, f"wrote {path}")

@@ -6,28 +6,26 @@ inverted by its written-out Cholesky factor: a batched LAPACK call costs tens of
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-class Whitener(NamedTuple):
-    """W = L⁻¹ of S = L Lᵀ (2 × 2): W z is white, zᵀS⁻¹z = |W z|². Lower triangular, kept as its three numbers."""
+def whitener(S: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
+    """W = L⁻¹ of a positive definite S = L Lᵀ (L lower triangular): W z is white, zᵀ S⁻¹ z = |W z|².
 
-    w11: Float[Array, "..."]
-    w21: Float[Array, "..."]
-    w22: Float[Array, "..."]
+    With S = [a b; b c]: W = [1/√a 0; -b/√(a Δ) a/√(a Δ)], Δ = a c - b². An S that is not positive definite gives NaN,
+    which the run's flag reports.
+    """
+    a, b, c = S[0, 0], S[1, 0], S[1, 1]
+    first, second = jax.lax.rsqrt(jnp.stack([a, a * (a * c - b * b)]))
+    return jnp.stack([jnp.stack([first, jnp.zeros_like(a)]), jnp.stack([-b * second, a * second])])
 
-    def __call__(self, a: Float[Array, " 2 *n"]) -> Float[Array, " 2 *n"]:
-        """W a, for a vector (2,) or the rows of a matrix (2, n)."""
-        return jnp.stack([self.w11 * a[0], self.w21 * a[0] + self.w22 * a[1]])
 
-
-def whitener(S: Float[Array, "2 2"]) -> Whitener:
-    """Inverse Cholesky factor of a positive definite S. An S that is not gives NaN, which the run's flag reports."""
-    l11 = jnp.sqrt(S[0, 0])
-    l21 = S[1, 0] / l11
-    l22 = jnp.sqrt(S[1, 1] - l21 * l21)
-    return Whitener(1.0 / l11, -l21 / (l11 * l22), 1.0 / l22)
+def whiten(W: Float[Array, "2 2"], rows: Float[Array, "2 ..."]) -> Float[Array, "2 ..."]:
+    """W times a vector (2,) or a matrix of two rows (2, n), written out so that it fuses with what comes next."""
+    columns = W.T.reshape(2, 2, *(1,) * (rows.ndim - 1))
+    return columns[0] * rows[0] + columns[1] * rows[1]
 
 
 def innovation_cov(H: Float[Array, "2 n"], P: Float[Array, "n n"], R: Float[Array, "2 2"]) -> Float[Array, "2 2"]:
@@ -37,7 +35,7 @@ def innovation_cov(H: Float[Array, "2 n"], P: Float[Array, "n n"], R: Float[Arra
 
 def mahalanobis(z: Float[Array, "2"], S: Float[Array, "2 2"]) -> Float[Array, ""]:
     """Squared Mahalanobis distance zᵀ S⁻¹ z. Paper equations (13) and (14)."""
-    return jnp.sum(whitener(S)(z) ** 2)
+    return jnp.sum(whiten(whitener(S), z) ** 2)
 
 
 class Correction(NamedTuple):
@@ -55,5 +53,5 @@ def correct(P: Float[Array, "n n"], H: Float[Array, "2 n"], z: Float[Array, "2"]
     With U = W H P (W the whitener of S) these are Uᵀ(W z) and P - Uᵀ U: symmetric by construction.
     """
     W = whitener(S)
-    U = W(H @ P)
-    return Correction(U.T @ W(z), P - U.T @ U)
+    U = whiten(W, H @ P)
+    return Correction(U.T @ whiten(W, z), P - U.T @ U)

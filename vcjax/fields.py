@@ -10,7 +10,7 @@ from collections.abc import Callable
 from numbers import Integral
 from typing import Any
 
-import jax
+import jax.core
 import numpy as np
 
 
@@ -53,8 +53,7 @@ def require(
 
     Raises:
         ValueError: if it has another length, any element is no number, NaN or breaks the condition. Of traced values
-        only
-            the length is checked.
+            only the length is checked.
     """
     value, owner_name = getattr(owner, name), type(owner).__name__
     try:

@@ -1,8 +1,10 @@
 """Filter runs for the tests, frame by frame: one compilation for each static configuration, shared by all test files."""
 
+import dataclasses
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -17,21 +19,41 @@ from vcjax.simulation.simulate import simulate
 CAPACITY = 112
 """Slots enough for every landmark that 160 frames of the paper's scenarios give birth to."""
 
-start, step = jax.jit(slam.start), jax.jit(slam.step)
-_simulate = jax.jit(simulate)
+start, step, predict = jax.jit(slam.start), jax.jit(slam.step), jax.jit(slam.predict)
+simulate_once = jax.jit(simulate)
+# For functions that are compiled for a few calls only: half the time to compile, the same numbers.
+quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
+
+@quick_jit
+def start_jvp(primals, tangents):
+    """Derivative of (config, recording) -> (state, info); None is the tangent of what is no real number."""
+    return eqx.filter_jvp(slam.start, primals, tangents)
+
+
+@quick_jit
+def step_jvp(primals, tangents):
+    """Derivative of (config, state, frame) -> (state, info)."""
+    return eqx.filter_jvp(slam.step, primals, tangents)
+
+
+def zero_tangent(tree):
+    """A tangent of zeros, None where a leaf is no real number."""
+    return jax.tree.map(lambda x: np.zeros_like(x) if eqx.is_inexact_array_like(x) else None, tree)
 
 
 @cache
 def recorded(seed: int, **scenario) -> Recording:
     """A recording of one of the paper's scenarios, kept in NumPy."""
-    recording, _ = _simulate(paper(**scenario), jax.random.key(seed))
-    return jax.tree.map(np.asarray, recording)
+    recording, _ = simulate_once(paper(**scenario), jax.random.key(seed))
+    return jax.device_get(recording)
 
 
 def head(recording: Recording, num_frames: int) -> Recording:
     """The first frames of a recording. (`is_last` still tells of the whole.)"""
     once = ("camera", "robot_start", "sensor_start", "start_cov")
-    return Recording(**{k: v if k in once else v[:num_frames] for k, v in vars(recording).items()})
+    fields = {k: v if k in once else v[:num_frames] for k, v in vars(recording).items()}
+    return dataclasses.replace(recording, **fields)
 
 
 def filtered(config: FilterConfig, recording: Recording, key=None) -> Iterator[tuple[FilterState, FrameInfo]]:

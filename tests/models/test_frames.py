@@ -144,12 +144,9 @@ def test_written_out_jacobian_of_rotating_back_is_its_derivative():
     assert_close(frames.rotate_back_jacobian(q, v), expected)
 
 
-SPECIAL_TURNS = {"none": [1, 0, 0, 0], "none, negative": [-1, 0, 0, 0], "half x": [0, 1, 0, 0], "half": [0, 0.6, 0, -0.8]}
-
-
-@pytest.mark.parametrize("turn", SPECIAL_TURNS.values(), ids=SPECIAL_TURNS)
-def test_log_has_finite_derivatives_at_no_and_at_half_a_turn(turn):
-    assert_finite(frames.rotation_vector_from_quaternion, jnp.array(turn, float))
+def test_log_has_finite_derivatives_at_no_and_at_half_a_turn():
+    for turn in ([1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0.6, 0, -0.8]):
+        assert_finite(frames.rotation_vector_from_quaternion, jnp.array(turn, float))
 
 
 def test_exp_has_finite_derivatives_at_zero():

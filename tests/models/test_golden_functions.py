@@ -61,11 +61,10 @@ def test_value_and_derivative_are_golden(golden, name):
     # A matrix is golden column by column.
     expected = column(cases, value).mT.reshape(len(cases), -1) if name == "q2R" else column(cases, value)
     assert_golden(jax.jit(jax.vmap(function))(*columns), expected)
-    for jacobian in (jax.jacfwd, jax.jacrev):
-        ours = jax.jit(jax.vmap(jacobian(function, tuple(range(len(columns))))))(*columns)
-        for got, wanted in zip(ours, jacobians, strict=True):
-            if wanted is not None:
-                assert_golden(got, column(cases, wanted))
+    ours = jax.jit(jax.vmap(jax.jacfwd(function, tuple(range(len(columns))))))(*columns)
+    for got, wanted in zip(ours, jacobians, strict=True):
+        if wanted is not None:
+            assert_golden(got, column(cases, wanted))
 
 
 @pytest.mark.parametrize(("name", "point"), [("projEuc", "p"), ("projAhm", "ahm")])

@@ -42,9 +42,11 @@ class FilterConfig(eqx.Module):
     """Free the slot of a landmark after its track's last measurement in the recording: exact for everything else."""
     blacklist_capacity: int = eqx.field(static=True, default=0)
     """How many deleted features are remembered and never born again; 0: a deleted feature may come back."""
+    skip_free_slots: bool = eqx.field(static=True, default=True)
+    """Pass over the part of P in use only, by a loop whose length depends on the map: best where runs go one by one, as
+    on a CPU. False passes over all of P at once: best under `vmap`. The numbers are the same."""
     reverse_mode: bool = eqx.field(static=True, default=False)
-    """Make the run differentiable in reverse mode too (a bounded loop over recovered features instead of a free
-    one)."""
+    """Make the run differentiable in reverse mode too: loops of fixed length only, `skip_free_slots` has no effect."""
     toolbox_parity: bool = eqx.field(static=True, default=False)
     """Use the scalar shortcut for derivatives of unit vectors, as the paper's toolbox does (see `frames.unit`)."""
 

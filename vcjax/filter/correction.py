@@ -7,15 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vcjax.ekf import mahalanobis, whitener
+from vcjax.ekf import mahalanobis, whiten, whitener
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.features import measurement_model, observe
+from vcjax.filter.reparametrisation import AtCorrection
 from vcjax.filter.state import SLOT, VEHICLE
-from vcjax.filter.submap import Submap, block, block_cov, slot_rows
+from vcjax.filter.submap import Submap, block, block_columns, block_cov, landmark_means, slot_rows, vehicle_mean
 from vcjax.gates.gate import Candidates, Verdict
 from vcjax.models.camera import Camera
-from vcjax.models.frames import unit
-from vcjax.models.landmarks import INVERSE_DEPTH, euclidean, linearity_index, to_point, to_point_jacobian
+from vcjax.models.landmarks import INVERSE_DEPTH
 
 
 class Innovation(NamedTuple):
@@ -83,20 +83,33 @@ def correct_frame(
     )
     verdict = gate.judge(candidates, measurement_model(config, camera))
     submap = _correct_recovered(config, camera, submap, uv_px, verdict.is_recovered)
+    submap = eqx.tree_at(lambda s: s.is_corrected, submap, is_accepted | verdict.is_recovered)
     return submap, Outcome(innovation, is_accepted, verdict)
+
+
+class Gain(NamedTuple):
+    """What a correction needs beside its innovation."""
+
+    H: Float[Array, "2 21"]
+    PH: Float[Array, "n 2"]
+    """P Hᵀ."""
+    UH: Float[Array, "M 2"]
+    """U Hᵀ, of the rows of the corrections so far."""
 
 
 def innovate(
     config: FilterConfig, camera: Camera, submap: Submap, j: int | Int[Array, ""], uv_px: Float[Array, "2"]
-) -> tuple[Innovation, Float[Array, "2 21"], Float[Array, "2 n"]]:
-    """Innovation of candidate j at the submap's present state, with H and H P. Equations (8), (9), (13)."""
+) -> tuple[Innovation, Gain]:
+    """Innovation of candidate j at the submap's present state. Equations (8), (9), (13)."""
     observation = observe(config, camera, block(submap, j))
-    H_v, H_l = observation.H[:, :VEHICLE], observation.H[:, VEHICLE:]
-    HP = H_v @ submap.P[:VEHICLE] + H_l @ jax.lax.dynamic_slice_in_dim(submap.P, slot_rows(j), SLOT)
-    own = jax.lax.dynamic_slice_in_dim(HP, slot_rows(j), SLOT, axis=1)
-    S = HP[:, :VEHICLE] @ H_v.T + own @ H_l.T + _pixel_cov(config, HP.dtype)
+    H = observation.H
+    # P is symmetric, so its columns may be read with those of U: one product gives P Hᵀ and U Hᵀ.
+    both = block_columns(jnp.concatenate([submap.P, submap.U]), j) @ H.T
+    PH, UH = both[: submap.P.shape[0]], both[submap.P.shape[0] :]
+    own = jnp.concatenate([PH[:VEHICLE], jax.lax.dynamic_slice_in_dim(PH, slot_rows(j), SLOT)])
+    S = H @ own + _pixel_cov(config, H.dtype)
     z = uv_px - observation.pixel
-    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible), observation.H, HP
+    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible), Gain(H, PH, UH)
 
 
 def _correct_sequentially(
@@ -111,10 +124,10 @@ def _correct_sequentially(
 
     def correct_next(submap: Submap, candidate):
         j, y, is_used = candidate
-        innovation, H, HP = innovate(config, camera, submap, j, y)
+        innovation, gain = innovate(config, camera, submap, j, y)
         if is_gated:
             is_used = is_used & config.gate.accepts(innovation.re1)
-        return _apply(config, submap, j, innovation, H, HP, is_used), (innovation, is_used)
+        return _apply(submap, j, innovation, gain, is_used), (innovation, is_used)
 
     candidates = (jnp.arange(is_candidate.shape[0]), uv_px, is_candidate)
     submap, (innovation, is_accepted) = jax.lax.scan(correct_next, submap, candidates)
@@ -135,43 +148,44 @@ def _correct_recovered(
     def correct_next(carry):
         submap, is_left = carry
         j = jnp.argmax(is_left)
-        innovation, H, HP = innovate(config, camera, submap, j, uv_px[j])
-        return _apply(config, submap, j, innovation, H, HP, is_left[j]), is_left.at[j].set(False)
+        innovation, gain = innovate(config, camera, submap, j, uv_px[j])
+        return _apply(submap, j, innovation, gain, is_left[j]), is_left.at[j].set(False)
 
     return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), correct_next, (submap, is_recovered))[0]
 
 
 def _apply(
-    config: FilterConfig,
-    submap: Submap,
-    j: int | Int[Array, ""],
-    innovation: Innovation,
-    H: Float[Array, "2 21"],
-    HP: Float[Array, "2 n"],
-    is_used: Bool[Array, ""],
+    submap: Submap, j: int | Int[Array, ""], innovation: Innovation, gain: Gain, is_used: Bool[Array, ""]
 ) -> Submap:
     """One correction, u = W H P: P - uᵀu and x + uᵀ(W z); nothing at all where it is not used. Equations (10)–(12)."""
     W = whitener(innovation.S)
-    u = jnp.where(is_used, W(HP), 0.0)
-    w = jnp.where(is_used, W(innovation.z), 0.0)
-    own = jax.lax.dynamic_slice_in_dim(submap.U, slot_rows(j), SLOT, axis=1)
-    H_u = submap.U[:, :VEHICLE] @ H[:, :VEHICLE].T + own @ H[:, VEHICLE:].T
-    H_wide = jnp.zeros_like(HP).at[:, :VEHICLE].set(H[:, :VEHICLE])
-    H_wide = jax.lax.dynamic_update_slice_in_dim(H_wide, H[:, VEHICLE:], slot_rows(j), axis=1)
-    c = jnp.where(is_used, W(H_wide - H_u.T @ submap.C), 0.0)
+    wide = jnp.zeros_like(gain.PH.T).at[:, :VEHICLE].set(gain.H[:, :VEHICLE])
+    wide = jax.lax.dynamic_update_slice_in_dim(wide, gain.H[:, VEHICLE:], slot_rows(j), axis=1)
+    u = jnp.where(is_used, whiten(W, gain.PH.T), 0.0)
+    c = jnp.where(is_used, whiten(W, wide - gain.UH.T @ submap.C), 0.0)
+    w = jnp.where(is_used, whiten(W, innovation.z), 0.0)
 
-    moved = _move(config, submap, u.T @ w)
+    def write(rows, new, index):
+        # A correction passed through a second time without being used must not wipe out what was noted at the first.
+        old = jax.lax.dynamic_slice_in_dim(rows, index, new.shape[0])
+        return jax.lax.dynamic_update_slice_in_dim(rows, jnp.where(is_used, new, old), index, axis=0)
+
+    vehicle_before = vehicle_mean(submap)
     moved = eqx.tree_at(
-        lambda m: (m.P, m.U, m.C, m.w),
-        moved,
+        lambda s: (s.shift, s.P, s.U, s.C, s.w),
+        submap,
         (
+            submap.shift + u.T @ w,
             submap.P - u.T @ u,
-            jax.lax.dynamic_update_slice_in_dim(submap.U, u, 2 * j, axis=0),
-            jax.lax.dynamic_update_slice_in_dim(submap.C, c, 2 * j, axis=0),
-            jax.lax.dynamic_update_slice_in_dim(submap.w, w, 2 * j, axis=0),
+            write(submap.U, u, 2 * j),
+            write(submap.C, c, 2 * j),
+            write(submap.w, w, 2 * j),
         ),
     )
-    return _settle(config, submap.vehicle, moved, j, is_used)
+    last = slot_rows(j) + INVERSE_DEPTH
+    noted = AtCorrection(block(moved, j).landmark, moved.P[last, last], vehicle_before)
+    at_correction = jax.tree.map(lambda rows, new: write(rows, new[None], j), submap.at_correction, noted)
+    return eqx.tree_at(lambda s: s.at_correction, moved, at_correction)
 
 
 def _correct_stacked(
@@ -194,57 +208,13 @@ def _correct_stacked(
     L = jnp.linalg.cholesky(HP @ H.T + R)
     U, C = (jax.scipy.linalg.solve_triangular(L, rows, lower=True) for rows in (HP, H))
     w = jax.scipy.linalg.solve_triangular(L, z, lower=True)
-    moved = _move(config, submap, U.T @ w)
-    moved = eqx.tree_at(lambda m: (m.P, m.U, m.C, m.w), moved, (submap.P - U.T @ U, U, C, w))
-    for j in range(num_candidates):
-        moved = _settle(config, submap.vehicle, moved, j, is_used[j])
-    return moved
-
-
-def _move(config: FilterConfig, submap: Submap, shift: Float[Array, " n"]) -> Submap:
-    """Move the submap's means by K z. Equation (11)."""
-    slots = shift[VEHICLE:].reshape(-1, SLOT)
-    landmarks = submap.landmarks + jnp.einsum("kij,kj->ki", submap.to_coordinates, slots)
-    return eqx.tree_at(lambda s: (s.vehicle, s.landmarks), submap, (submap.vehicle + shift[:VEHICLE], landmarks))
-
-
-def _settle(
-    config: FilterConfig,
-    vehicle_before: Float[Array, "14"],
-    submap: Submap,
-    j: int | Int[Array, ""],
-    is_used: Bool[Array, ""],
-) -> Submap:
-    """After its correction: keep landmark j's inverse depth positive, and make it Euclidean once it is near linear.
-
-    The linearity index is taken with the landmark after its correction and the camera pose from before it, as the
-    paper's toolbox does. The conversion leaves P alone (see `filter.state`).
-    """
-    landmark, T = submap.landmarks[j], submap.to_coordinates[j]
-    rho = landmark[INVERSE_DEPTH]
-    landmark = landmark.at[INVERSE_DEPTH].set(jnp.where(is_used & ~(rho > 0), config.inverse_depth_min, rho))
-
-    last = slot_rows(j) + INVERSE_DEPTH
-    variance = submap.P[last, last]
-    std = jnp.sqrt(jnp.where(variance > 0, variance, 1.0))
-    robot, sensor = (
-        jnp.concatenate([pose[:3], unit(pose[3:], config.toolbox_parity)])
-        for pose in (vehicle_before[:7], vehicle_before[7:])
+    vehicle_before = jnp.broadcast_to(vehicle_mean(submap), (num_candidates, VEHICLE))
+    moved = eqx.tree_at(
+        lambda s: (s.shift, s.P, s.U, s.C, s.w), submap, (submap.shift + U.T @ w, submap.P - U.T @ U, U, C, w)
     )
-    is_linear = linearity_index(robot, sensor, landmark, std) < config.linearity_max
-    becomes = is_used & is_linear & (variance > 0) & ~submap.is_euclidean[j]
-
-    J = to_point_jacobian(landmark)
-    T_euclidean = jnp.concatenate([J, jnp.zeros((SLOT - 3, SLOT), J.dtype)])
-    return eqx.tree_at(
-        lambda s: (s.landmarks, s.to_coordinates, s.is_euclidean),
-        submap,
-        (
-            submap.landmarks.at[j].set(jnp.where(becomes, euclidean(to_point(landmark)), landmark)),
-            submap.to_coordinates.at[j].set(jnp.where(becomes, T_euclidean, T)),
-            submap.is_euclidean.at[j].set(submap.is_euclidean[j] | becomes),
-        ),
-    )
+    last = slot_rows(jnp.arange(num_candidates)) + INVERSE_DEPTH
+    at_correction = AtCorrection(landmark_means(moved), moved.P[last, last], vehicle_before)
+    return eqx.tree_at(lambda s: s.at_correction, moved, at_correction)
 
 
 def _pixel_cov(config: FilterConfig, dtype) -> Float[Array, "2 2"]:

@@ -57,16 +57,16 @@ def give_birth(
     def attempt(carry, _):
         state, is_eligible = carry
         column = jnp.argmin(jnp.where(is_eligible, rank, last))
-        # Where nothing can be born, the spare slot takes the write: it is the last, and always free.
-        spare = state.track_id.shape[0] - 1
-        slot = jnp.where(is_eligible[column], jnp.argmin(state.is_mapped), spare)
-        is_born = slot != spare
+        first_free = jnp.argmin(state.is_mapped)
+        is_born = is_eligible[column] & (first_free < config.max_landmarks)
+        # Where nothing is born, the last slot, which is always free, takes the write.
+        slot = jnp.where(is_born, first_free, state.track_id.shape[0] - 1)
         born_id = jnp.where(is_born, frame.track_id[column], FREE)
         state = _initialise(config, state, frame, column, slot, born_id)
         return (state, is_eligible.at[column].set(is_eligible[column] & ~is_born)), born_id
 
     (state, is_waiting), born = jax.lax.scan(attempt, (state, is_eligible), None, length=num_births)
-    return state, born, jnp.any(is_waiting) & jnp.all(state.is_mapped[:-1])
+    return state, born, jnp.any(is_waiting) & jnp.all(state.is_mapped[: config.max_landmarks])
 
 
 def _initialise(

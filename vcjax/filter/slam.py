@@ -14,7 +14,7 @@ from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import choose, match, predict_features
-from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state
+from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state, slot_count
 from vcjax.filter.submap import gather, scatter
 from vcjax.gates.gate import Evidence
 from vcjax.models.motion import move_by_odometry
@@ -167,7 +167,7 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
         is_accepted=nobody,
         is_recovered=nobody,
         is_dynamic=nobody,
-        inconsistent_id=jnp.full(config.max_landmarks + 1, FREE, jnp.int32),
+        inconsistent_id=jnp.full(slot_count(config), FREE, jnp.int32),
     )
     is_mapped = jnp.zeros_like(frame.is_valid)
     return _finish(config, state, frame, is_mapped, config.births_first_frame, info_of_candidates)

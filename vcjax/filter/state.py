@@ -10,8 +10,9 @@ that moment. As Kalman updates are linear in the error, using H J with the old r
 numbers that P's rows transformed by J would give, and no pass over P is needed.
 
 A free slot's rows hold whatever they held before: the numbers of a landmark that is never looked at again. They are as
-inert as zeros would be, and cost nothing to leave. The last slot is a spare: always free, it takes the writes of births
-that do not happen, so that no branch and no copy of P is needed. Hence L = max_landmarks + 1.
+inert as zeros would be, and cost nothing to leave. L is the capacity rounded up to whole blocks of slots with at least
+one to spare: the last slot, always free, takes the writes of births that do not happen, so that no branch and no copy
+of P is needed.
 """
 
 import equinox as eqx
@@ -27,6 +28,8 @@ VEHICLE = 14
 """Error coordinates of robot and sensor."""
 SLOT = 7
 """Error coordinates of a landmark slot."""
+SLOTS_PER_BLOCK = 16
+"""Slots that P_mm's passes take at a time."""
 FREE = -1
 """Track id of a free slot."""
 
@@ -73,6 +76,11 @@ class FilterState(eqx.Module):
         return self.vehicle[7:]
 
 
+def slot_count(config: FilterConfig) -> int:
+    """L, the number of slots: max_landmarks and at least one to spare, in whole blocks."""
+    return SLOTS_PER_BLOCK * (config.max_landmarks // SLOTS_PER_BLOCK + 1)
+
+
 def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None) -> FilterState:
     """The state before the first frame: start poses with their covariance, and an empty map.
 
@@ -84,7 +92,7 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
             f"initial_state(key={key}): give a key if and only if births are in random order "
             f"(FilterConfig(birth_order={config.birth_order!r}))."
         )
-    num_slots = config.max_landmarks + 1
+    num_slots = slot_count(config)
     poses = (jnp.asarray(recording.robot_start), jnp.asarray(recording.sensor_start))
     vehicle = jnp.concatenate([part for pose in poses for part in (pose[:3], unit(pose[3:]))])
     dtype = vehicle.dtype

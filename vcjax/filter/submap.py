@@ -22,40 +22,69 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.features import Block
-from vcjax.filter.state import SLOT, VEHICLE, FilterState
+from vcjax.filter.reparametrisation import AtCorrection, Slots, settle
+from vcjax.filter.state import SLOT, SLOTS_PER_BLOCK, VEHICLE, FilterState
 from vcjax.models.frames import unit, unit_jacobian
 
 
-def slot_rows(j: int | Int[Array, ""]) -> int | Int[Array, ""]:
-    """First row of candidate j in the submap."""
-    return VEHICLE + SLOT * j
-
-
 class Submap(eqx.Module):
-    """Vehicle and K chosen slots: their part of x and P, kept current, and the record of what was done."""
+    """Vehicle and K chosen slots: the frame's prediction, what the corrections so far did to it, and their record."""
 
     vehicle: Float[Array, "14"]
+    """Predicted mean of the vehicle."""
     landmarks: Float[Array, "K 7"]
+    """Predicted means of the chosen landmarks."""
     to_coordinates: Float[Array, "K 7 7"]
     is_euclidean: Bool[Array, " K"]
+    shift: Float[Array, " n"]
+    """Σ K z of the corrections so far, by which the means have moved."""
     P: Float[Array, "n n"]
+    """Covariance, current."""
     U: Float[Array, "M n"]
     """Rows u_j of the corrections so far, two for each; M = 2 K."""
     C: Float[Array, "M n"]
     """The same rows as combinations of the rows of P⁰."""
     w: Float[Array, " M"]
     """White innovations W z."""
+    at_correction: AtCorrection
+    """What was noted of each landmark when it was corrected with (leading axis K)."""
+    is_corrected: Bool[Array, " K"]
+    """Which were corrected with."""
+
+
+def slot_rows(j: int | Int[Array, "*j"]) -> int | Int[Array, "*j"]:
+    """First row of candidate j in the submap."""
+    return VEHICLE + SLOT * j
+
+
+def vehicle_mean(submap: Submap) -> Float[Array, "14"]:
+    """Current mean of the vehicle. Its quaternions may be off unit length until the frame ends."""
+    return submap.vehicle + submap.shift[:VEHICLE]
+
+
+def landmark_means(submap: Submap) -> Float[Array, "K 7"]:
+    """Current means of the chosen landmarks."""
+    slots = submap.shift[VEHICLE:].reshape(-1, SLOT)
+    return submap.landmarks + jnp.sum(submap.to_coordinates * slots[:, None], axis=-1)
 
 
 def block(submap: Submap, j: int | Int[Array, ""]) -> Block:
-    """Mean of the block of candidate j."""
-    return Block(submap.vehicle, submap.landmarks[j], submap.to_coordinates[j])
+    """Current mean of the block of candidate j."""
+    T = submap.to_coordinates[j]
+    slot = jax.lax.dynamic_slice_in_dim(submap.shift, slot_rows(j), SLOT)
+    return Block(vehicle_mean(submap), submap.landmarks[j] + jnp.sum(T * slot, axis=-1), T)
 
 
 def block_cov(submap: Submap, j: int | Int[Array, ""]) -> Float[Array, "21 21"]:
     """Covariance of the block of candidate j: vehicle and its slot."""
-    rows = jnp.concatenate([submap.P[:VEHICLE], jax.lax.dynamic_slice_in_dim(submap.P, slot_rows(j), SLOT)])
-    return jnp.concatenate([rows[:, :VEHICLE], jax.lax.dynamic_slice_in_dim(rows, slot_rows(j), SLOT, axis=1)], axis=1)
+    columns = block_columns(submap.P, j)
+    return jnp.concatenate([columns[:VEHICLE], jax.lax.dynamic_slice_in_dim(columns, slot_rows(j), SLOT)])
+
+
+def block_columns(matrix: Float[Array, "rows n"], j: int | Int[Array, ""]) -> Float[Array, "rows 21"]:
+    """The columns of vehicle and slot of candidate j."""
+    own = jax.lax.dynamic_slice_in_dim(matrix, slot_rows(j), SLOT, axis=-1)
+    return jnp.concatenate([matrix[..., :VEHICLE], own], axis=-1)
 
 
 def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Array, "n M"]]:
@@ -71,10 +100,17 @@ def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Ar
         landmarks=state.landmarks[slot],
         to_coordinates=state.to_coordinates[slot],
         is_euclidean=state.is_euclidean[slot],
+        shift=jnp.zeros(P.shape[0], P.dtype),
         P=P,
         U=empty,
         C=empty,
         w=jnp.zeros(2 * num_chosen, P.dtype),
+        at_correction=AtCorrection(
+            jnp.zeros((num_chosen, SLOT), P.dtype),
+            jnp.zeros(num_chosen, P.dtype),
+            jnp.zeros((num_chosen, VEHICLE), P.dtype),
+        ),
+        is_corrected=jnp.zeros(num_chosen, bool),
     )
     return submap, rows
 
@@ -84,26 +120,45 @@ def scatter(
 ) -> FilterState:
     """The state after the frame's corrections, from the submap and the rows it was gathered with.
 
-    The rest of the state follows by U = C P⁰[submap, :]. Then both quaternions are brought to unit length, q/|q|, and
-    P ← N P Nᵀ with N the derivative of that.
+    The rest of the state follows by U = C P⁰[submap, :]. Landmarks settle (see `reparametrisation`). Then both
+    quaternions are brought to unit length, q/|q|, and P ← N P Nᵀ with N the derivative of that.
     """
     U = submap.C @ rows
     shift = (U.T @ submap.w).reshape(-1, SLOT)
-    landmarks = state.landmarks + jnp.einsum("lij,lj->li", state.to_coordinates, shift)
-    vehicle, N = normalise(config, submap.vehicle)
+    landmarks = state.landmarks + jnp.sum(state.to_coordinates * shift[:, None], axis=-1)
+    slots = Slots(landmark_means(submap), submap.to_coordinates, submap.is_euclidean)
+    slots = settle(config, slots, submap.at_correction, submap.is_corrected)
+    vehicle, N = normalise(config, vehicle_mean(submap))
     return eqx.tree_at(
         lambda s: (s.vehicle, s.landmarks, s.to_coordinates, s.is_euclidean, s.P_vv, s.P_vm, s.P_mm),
         state,
         (
             vehicle,
-            landmarks.at[slot].set(submap.landmarks),
-            state.to_coordinates.at[slot].set(submap.to_coordinates),
-            state.is_euclidean.at[slot].set(submap.is_euclidean),
+            landmarks.at[slot].set(slots.landmarks),
+            state.to_coordinates.at[slot].set(slots.to_coordinates),
+            state.is_euclidean.at[slot].set(slots.is_euclidean),
             N @ submap.P[:VEHICLE, :VEHICLE] @ N.T,
             N @ (state.P_vm - submap.U[:, :VEHICLE].T @ U),
-            state.P_mm - U.T @ U,
+            downdate(config, state, U),
         ),
     )
+
+
+def downdate(config: FilterConfig, state: FilterState, U: Float[Array, "K2 M"]) -> Float[Array, "M M"]:
+    """P_mm - Uᵀ U, all of it or the blocks of rows up to the last slot in use; free slots' rows mean nothing."""
+    if config.reverse_mode or not config.skip_free_slots:
+        return state.P_mm - U.T @ U
+    num_slots = state.track_id.shape[0]
+    num_used = jnp.max(jnp.where(state.is_mapped, jnp.arange(1, num_slots + 1), 0))
+    size = SLOTS_PER_BLOCK * SLOT
+
+    def downdate_block(i, P_mm):
+        rows = jax.lax.dynamic_slice_in_dim(P_mm, size * i, size)
+        rows -= jax.lax.dynamic_slice_in_dim(U, size * i, size, axis=1).T @ U
+        return jax.lax.dynamic_update_slice_in_dim(P_mm, rows, size * i, axis=0)
+
+    num_blocks = (num_used + SLOTS_PER_BLOCK - 1) // SLOTS_PER_BLOCK
+    return jax.lax.fori_loop(0, num_blocks, downdate_block, state.P_mm)
 
 
 def normalise(config: FilterConfig, vehicle: Float[Array, "14"]) -> tuple[Float[Array, "14"], Float[Array, "14 14"]]:

@@ -54,7 +54,7 @@ class InlierRatio(AbstractDetector):
             count(state.measured, evidence.is_measured),
             count(state.corrected, evidence.is_corrected),
         )
-        is_inconsistent = (state.measured < self.min_measured_ratio * state.searched) | (
-            state.corrected < self.min_corrected_ratio * state.measured
+        is_inconsistent = (state.measured / state.searched < self.min_measured_ratio) | (
+            state.corrected / state.measured < self.min_corrected_ratio
         )
         return state, evidence.is_visible & (state.searched >= self.min_searches) & is_inconsistent

@@ -65,12 +65,14 @@ def project_landmark(
     v = R_s.T @ w_r
     pixel, U_v = pixel_jacobian(camera, v)
 
-    V_r = jnp.concatenate([-rho * R_cT, R_s.T @ rotate_back_jacobian(robot[3:], w)], axis=1)
-    V_s = jnp.concatenate([-rho * R_s.T, rotate_back_jacobian(sensor[3:], w_r)], axis=1)
-    V_rho = R_cT @ offset - R_s.T @ sensor[:3]
-    V_l = jnp.concatenate([rho * R_cT, R_cT, V_rho[:, None]], axis=1)
+    # ∂v by [t_r, q_r, t_s, q_s, p₀, m, ρ], side by side so that one product leads to the pixel.
+    by_q_r = R_s.T @ rotate_back_jacobian(robot[3:], w)
+    by_q_s = rotate_back_jacobian(sensor[3:], w_r)
+    by_rho = R_cT @ offset - R_s.T @ sensor[:3]
+    V = jnp.concatenate([-rho * R_cT, by_q_r, -rho * R_s.T, by_q_s, rho * R_cT, R_cT, by_rho[:, None]], axis=1)
+    U = U_v @ V
     depth = v[2] / jnp.where(rho == 0.0, 1.0, rho)
-    return pixel, depth, U_v @ V_r, U_v @ V_s, U_v @ V_l
+    return pixel, depth, U[:, :7], U[:, 7:14], U[:, 14:]
 
 
 def back_project_landmark(

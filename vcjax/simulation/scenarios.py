@@ -96,9 +96,8 @@ def paper(
     """One of the paper's experiments (section 4, Table 1).
 
     Args:
-        robot: forward along x from (-8, 0); curved by 0.5° per frame from (-8, -8); or lateral along y, looking along
-        x,
-            from (-4, -4).
+        robot: forward along x from (-8, 0); curved by 0.5° per frame from (-8, -8); or lateral along y, looking
+            along x, from (-4, -4).
         dynamic: None for a static scene, or how the dynamic features move: lateral (+y) or inverse forward (-x).
         dynamic_speed_m_s: their speed, m/s, at least 0.
         dynamic_set: the six features ahead of the robot, the six near its path, or feature ids of one's own.

@@ -26,7 +26,7 @@ def simulate(scenario: Scenario, key: PRNGKeyArray) -> tuple[Recording, Truth]:
 
     Args:
         scenario: the experiment; any of its numbers may be traced or differentiated (what is observed has zero
-        derivative).
+            derivative).
         key: of the run's noise.
 
     Returns: the recording, with one column for each feature of the world, and the truth.

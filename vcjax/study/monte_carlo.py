@@ -9,6 +9,7 @@ grouped.
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from numbers import Integral
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ from vcjax.filter.slam import run
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import simulate
 from vcjax.study.metrics import run_metrics
-from vcjax.study.results import as_dataset
+from vcjax.study.results import as_dataset, import_xarray
 from vcjax.study.sweep import Experiment, Sweep, check_sweep, replace_at
 
 MAX_LANES_PER_CALL = 256
@@ -36,7 +37,7 @@ def monte_carlo(
     key: PRNGKeyArray,
     first_seed: int = 0,
     sweep: Sweep | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm] (jax.Device is untyped)
     progress: Callable[[int, int], None] | None = None,
 ):
     """Run a scenario for many seeds, and for every point of a sweep, and compare with the truth.
@@ -51,8 +52,7 @@ def monte_carlo(
         key: base key, e.g. `jax.random.key(0)`.
         first_seed: number of the first seed; seeds are `first_seed … first_seed + num_seeds - 1`.
         sweep: path of a numeric leaf → values, e.g. `{"config.gate.th1": [6, 9, 12],
-        "scenario.oscillation.amplitude_m":
-            [0, 0.05]}`; several paths span a grid.
+            "scenario.oscillation.amplitude_m": [0, 0.05]}`; several paths span a grid.
         devices: devices to use; all local ones if None.
         progress: called with (lanes done, lanes in all).
 
@@ -60,13 +60,12 @@ def monte_carlo(
         xarray.Dataset with dimensions (*sweep paths, seed, frame or feature); see `results.as_dataset`.
 
     Raises:
-        ValueError: for bad numbers of seeds, unknown sweep paths or values out of range, before anything compiles.
+        ValueError: for a bad number of seeds, key or list of devices, unknown sweep paths or values out of range,
+            before anything compiles.
         ModuleNotFoundError: if xarray is not installed.
     """
-    if num_seeds < 1:
-        raise ValueError(f"monte_carlo(num_seeds={num_seeds}): give at least one seed.")
-    if first_seed < 0:
-        raise ValueError(f"monte_carlo(first_seed={first_seed}): seeds are numbered from 0.")
+    import_xarray()  # where it is missing, say so now and not after the work
+    _check_arguments(num_seeds, first_seed, key, devices)
     experiment = Experiment(scenario, FilterConfig() if config is None else config)
     values = check_sweep(experiment, sweep or {})
     seeds = np.arange(first_seed, first_seed + num_seeds)
@@ -78,12 +77,27 @@ def monte_carlo(
     return as_dataset(lanes, experiment, values, seeds, key)
 
 
+def _check_arguments(num_seeds: int, first_seed: int, key: PRNGKeyArray, devices: Sequence | None) -> None:
+    """Refuse what `monte_carlo` cannot run, naming argument, value and remedy."""
+    if not isinstance(num_seeds, Integral) or num_seeds < 1:
+        raise ValueError(f"monte_carlo(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
+    if not isinstance(first_seed, Integral) or not 0 <= first_seed <= 2**32 - num_seeds:
+        raise ValueError(f"monte_carlo(first_seed={first_seed!r}): seeds are whole numbers from 0 to 2**32 - 1.")
+    is_key = isinstance(key, jax.Array) and (
+        key.shape == () if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) else key.shape == (2,)
+    )
+    if not is_key:
+        raise ValueError(f"monte_carlo(key={key!r}): give one random key, e.g. jax.random.key(0).")
+    if devices is not None and len(devices) == 0:
+        raise ValueError("monte_carlo(devices=[]): give at least one device, or None for all.")
+
+
 def run_lanes(
     experiment: Experiment,
     swept: dict[str, np.ndarray],
     seeds: np.ndarray,
     key: PRNGKeyArray,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm] (jax.Device is untyped)
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, np.ndarray]:
     """Run a list of lanes, in calls of equal size so that one compilation serves all.
@@ -121,10 +135,7 @@ def run_lanes(
 def _run_lanes(experiment, swept, seeds, key, mesh: Mesh, batch_size: int) -> dict[str, Array]:
     def run_lane(lane):
         swept, seed = lane
-        point = experiment
-        for path, value in swept.items():
-            point = replace_at(point, path, value)
-        return run_one(point, jax.random.fold_in(key, seed))
+        return run_one(replace_at(experiment, swept), jax.random.fold_in(key, seed))
 
     def run_part(swept, seeds):
         return jax.lax.map(run_lane, (swept, seeds), batch_size=None if batch_size == 1 else batch_size)
@@ -137,7 +148,7 @@ def _run_lanes(experiment, swept, seeds, key, mesh: Mesh, batch_size: int) -> di
 def run_one(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Array]:
     """One run: simulate, filter, compare with the truth. Pure; the function to differentiate or to batch otherwise."""
     recording, truth = simulate(experiment.scenario, key)
-    # Births in random order draw from a key of their own, so that they do not disturb the noise.
-    birth_key = jax.random.fold_in(key, 1) if experiment.config.birth_order == "random" else None
+    # Births in random order draw from a key of their own; `simulate` splits the key, which uses up its folds 0 and 1.
+    birth_key = jax.random.fold_in(key, 2) if experiment.config.birth_order == "random" else None
     _, info = run(experiment.config, recording, birth_key)
     return run_metrics(info, truth)

@@ -22,7 +22,7 @@ from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import paper
 from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.paper import TABLES, Cell, cells
-from vcjax.study.results import attributes, load, save
+from vcjax.study.results import attributes, load, load_attributes, save
 from vcjax.study.storage import write_file
 from vcjax.study.sweep import Experiment
 
@@ -32,7 +32,7 @@ OSCILLATION_AMPLITUDE_M = 0.05
 GATES: Mapping[str, Callable[[], AbstractGate]] = {"RE": ReprojectionError, "VC": VirtualCorrection}
 """The gates by their names in the paper."""
 
-_BLOCK_NAME = re.compile(r"seeds_(\d{5})-(\d{5})\.nc")
+_BLOCK_NAME = re.compile(r"seeds_(\d{5,})-(\d{5,})\.nc")
 
 
 def cell_experiment(cell: Cell) -> Experiment:
@@ -66,13 +66,19 @@ def reproduce(
     Returns: the runs of each cell, an `xarray.Dataset` as from `monte_carlo`.
 
     Raises:
-        ValueError: for a bad number of seeds or table, or if the directory holds results of other settings.
+        ValueError: for a bad number of seeds or table, or if the directory holds results of other settings (of any
+            table: its cells are compared with each other).
         OSError: if the directory cannot be written.
     """
     if num_seeds < 1:
         raise ValueError(f"reproduce(num_seeds={num_seeds}): give at least one seed.")
+    if not tables:
+        raise ValueError(f"reproduce(tables={tuple(tables)}): give at least one of {TABLES}.")
     directory, chosen = Path(directory), cells(tables)
     key = jax.random.key(0) if key is None else key
+    for cell in cells():
+        for _, _, path in _blocks(directory / "runs" / cell.identifier):
+            _refuse_other_settings(path, cell_experiment(cell), key)
     write_file(directory / "README.txt", _README.encode())  # also tells at once whether the place can be written
     blocks = [(first, min(first + SEEDS_PER_BLOCK, num_seeds)) for first in range(0, num_seeds, SEEDS_PER_BLOCK)]
     # Gate by gate, since each compiles once; the paper's order within.
@@ -112,11 +118,8 @@ def load_results(
 def _run_block(folder: Path, cell: Cell, first: int, end: int, key: PRNGKeyArray) -> None:
     """Run one block of seeds unless it is there; a shorter one of the same first seed is replaced by the longer."""
     experiment = cell_experiment(cell)
-    for found_first, found_end, path in _blocks(folder):
-        if found_first == first:
-            _refuse_other_settings(path, experiment, key)
-            if found_end >= end:
-                return
+    if any(found_first == first and found_end >= end for found_first, found_end, _ in _blocks(folder)):
+        return
     runs = monte_carlo(experiment.scenario, experiment.config, num_seeds=end - first, first_seed=first, key=key)
     written = save(runs, folder / f"seeds_{first:05d}-{end - 1:05d}.nc")
     for found_first, _, path in list(_blocks(folder)):
@@ -133,7 +136,7 @@ def _blocks(folder: Path) -> Iterator[tuple[int, int, Path]]:
 
 def _refuse_other_settings(path: Path, experiment: Experiment, key: PRNGKeyArray) -> None:
     """Refuse to mix results of different settings."""
-    found = load(path).attrs
+    found = load_attributes(path)
     for name, value in attributes(experiment, key).items():
         if found.get(name) != value:
             raise ValueError(

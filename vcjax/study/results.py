@@ -7,6 +7,7 @@ single file, which can be written under a temporary name and renamed, so that a 
 import dataclasses
 import json
 import os
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -64,9 +65,11 @@ def as_dataset(
     Raises:
         ModuleNotFoundError: if xarray is not installed, with the remedy.
     """
-    xr = _xarray()
+    xr = import_xarray()
     outer = (*swept, "seed")
-    data = {name: ((*outer, "frame"), lanes[name], {"long_name": text}) for name, text in PER_FRAME.items()}
+    data: dict[str, Any] = {
+        name: ((*outer, "frame"), lanes[name], {"long_name": text}) for name, text in PER_FRAME.items()
+    }
     data |= {name: ((*outer, "feature"), lanes[name], {"long_name": text}) for name, text in PER_FEATURE.items()}
     data |= {name: (outer, lanes[name], {"long_name": text}) for name, text in PER_RUN.items()}
     data["robot"] = ((*outer, "frame", "pose"), lanes["robot"], {"long_name": "estimated robot pose"})
@@ -138,20 +141,37 @@ def load(path: str | os.PathLike) -> Any:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no results file of this schema.
     """
+    return _read(path, lambda dataset: dataset.load())
+
+
+def load_attributes(path: str | os.PathLike) -> dict[str, Any]:
+    """Read what results come from (see `attributes`), and not the results themselves; otherwise as `load`."""
+    return _read(path, lambda dataset: dataset.attrs)
+
+
+def _read(path: str | os.PathLike, part: Callable[[Any], Any]) -> Any:
+    xarray = import_xarray()
+    import h5py
+
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such results file.")
     try:
-        dataset = _xarray().load_dataset(path, engine="h5netcdf")
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"{path}: not a readable NetCDF-4 file ({error}).") from error
-    found = dataset.attrs.get("schema")
+        # Opened by h5py first: where that fails, h5netcdf fails too, but leaves an object that complains when it goes.
+        with h5py.File(path), xarray.open_dataset(path, engine="h5netcdf") as dataset:
+            found, result = dataset.attrs.get("schema"), part(dataset)
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise ValueError(f"{path}: not a readable NetCDF-4 file ({error}); remove it and run again.") from error
     if found != SCHEMA:
         raise ValueError(f"{path}: schema {found}, but this version reads {SCHEMA}.")
-    return dataset
+    return result
 
 
-def _xarray() -> Any:
-    """The labelled-array library, an optional dependency."""
+def import_xarray() -> Any:
+    """The labelled-array library, an optional dependency.
+
+    Raises:
+        ModuleNotFoundError: if it is not installed, with the remedy.
+    """
     try:
         import xarray
     except ModuleNotFoundError as error:

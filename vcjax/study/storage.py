@@ -1,6 +1,7 @@
 """Files that are complete or not there: written under a temporary name in the same folder, flushed, then renamed."""
 
 import contextlib
+import glob
 import os
 import tempfile
 from collections.abc import Iterator
@@ -18,8 +19,8 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         OSError: if the place cannot be written.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for leftover in path.parent.glob(f".{path.name}.*.tmp"):
+    _make_folder(path.parent)
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         leftover.unlink(missing_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     os.close(handle)
@@ -43,6 +44,27 @@ def write_file(path: str | os.PathLike, content: bytes) -> Path:
     with replacing(path) as temporary:
         temporary.write_bytes(content)
     return Path(path)
+
+
+def check_writable(path: str | os.PathLike) -> None:
+    """Refuse a place that a file cannot be written to, before the work that it is to hold; what is there stays.
+
+    Raises:
+        OSError: naming the place and what is wrong with it.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a directory; give the name of a file.")
+    _make_folder(path.parent)
+    with tempfile.TemporaryFile(dir=path.parent):
+        pass
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(f"{folder} is a file; give a place in a directory.") from None
 
 
 def _umask() -> int:

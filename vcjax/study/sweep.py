@@ -1,16 +1,21 @@
-"""Sweeping any numeric leaf of a scenario or configuration, named by its path, e.g. `config.gate.th1`."""
+"""Sweeping any numeric leaf of a scenario or configuration, named by its path, e.g. `config.gate.th1`.
+
+An element of a vector is named by its place: `scenario.odometry_std.0` is the first of its six numbers.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
+from vcjax.fields import is_concrete
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 
-Sweep = Mapping[str, Sequence[float]]
+Sweep = Mapping[str, Sequence[float] | Sequence[int] | np.ndarray]
 """Path of a numeric leaf → the values it takes. Several paths span a grid."""
 
 
@@ -21,20 +26,41 @@ class Experiment(eqx.Module):
     config: FilterConfig
 
 
-def replace_at(tree: Any, path: str, value: Any) -> Any:
-    """A copy of nested configuration objects with the leaf at `path` replaced; all objects on the way are checked."""
-    name, _, rest = path.partition(".")
-    return dataclasses.replace(tree, **{name: replace_at(getattr(tree, name), rest, value) if rest else value})
+def replace_at(tree: Any, values: Mapping[str, Any]) -> Any:
+    """A copy of nested configuration objects with other leaves at some paths.
+
+    All are replaced together, so that every object on the way is checked once, with its new numbers only.
+    """
+    below: dict[str, dict[str, Any]] = {}
+    for path, value in values.items():
+        name, _, rest = path.partition(".")
+        below.setdefault(name, {})[rest] = value
+    return dataclasses.replace(tree, **{name: _replaced(getattr(tree, name), new) for name, new in below.items()})
+
+
+def _replaced(field: Any, values: Mapping[str, Any]) -> Any:
+    """A field with other values at paths below it; the empty path is the field itself."""
+    if "" in values:
+        return values[""]
+    if dataclasses.is_dataclass(field):
+        return replace_at(field, values)
+    elements = [values.get(str(i), field[i]) for i in range(len(field))]
+    xnp = np if all(map(is_concrete, elements)) else jnp
+    return xnp.stack(xnp.broadcast_arrays(*elements), axis=-1)
 
 
 def numeric_paths(tree: Any) -> Iterator[str]:
-    """Paths of all scalar numeric leaves, those that can be swept."""
+    """Paths of all that can be swept: numeric leaves, and elements of numeric vectors."""
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
         if dataclasses.is_dataclass(value):
             yield from (f"{field.name}.{path}" for path in numeric_paths(value))
-        elif not field.metadata.get("static", False) and np.ndim(value) == 0 and value is not None:
+        elif value is None or field.metadata.get("static", False):
+            continue
+        elif np.ndim(value) == 0:
             yield field.name
+        elif np.ndim(value) == 1 and np.issubdtype(np.asarray(value).dtype, np.floating):
+            yield from (f"{field.name}.{i}" for i in range(len(value)))
 
 
 def check_sweep(experiment: Experiment, sweep: Sweep) -> dict[str, np.ndarray]:
@@ -42,16 +68,25 @@ def check_sweep(experiment: Experiment, sweep: Sweep) -> dict[str, np.ndarray]:
 
     Raises:
         ValueError: for an unknown path (the message lists those there are), an empty or nested list of values, or a
-        value
-            that the object it belongs to refuses.
+            point of the grid that the objects it belongs to refuse.
     """
     known = list(numeric_paths(experiment))
     values = {}
     for path, listed in sweep.items():
         if path not in known:
             raise ValueError(f"sweep has no numeric leaf {path!r}; choose among: {', '.join(known)}.")
-        values[path] = np.asarray(listed, float)
+        try:
+            values[path] = np.asarray(listed, float)
+        except (TypeError, ValueError):
+            values[path] = np.empty(0)
         if values[path].ndim != 1 or values[path].size == 0:
             raise ValueError(f"sweep[{path!r}] = {listed!r}: give a list of at least one number.")
-        replace_at(experiment, path, values[path])
+    grid = [axis.ravel() for axis in np.meshgrid(*values.values(), indexing="ij")]
+    try:
+        replace_at(experiment, dict(zip(values, grid, strict=True)))
+        return values
+    except ValueError:
+        pass
+    for point in zip(*grid, strict=True):  # one by one, so that the message names the value that is refused
+        replace_at(experiment, dict(zip(values, point, strict=True)))
     return values

@@ -1,0 +1,169 @@
+"""A frame's corrections on the submap, spread by one delayed downdate, against dense textbook updates of the whole P.
+
+Both are exact, so that they differ by rounding only: 1e-12 beside a covariance of up to 1 and pixels of up to 640.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from filter_runs import CAPACITY, filtered, head, recorded
+
+from vcjax.filter.config import FilterConfig
+from vcjax.filter.correction import correct_frame
+from vcjax.filter.features import Block, observe, predict_features
+from vcjax.filter.state import SLOT, VEHICLE
+from vcjax.filter.submap import gather, scatter
+from vcjax.gates.reprojection import ReprojectionError
+from vcjax.models.camera import Camera
+
+# No gate and no conversion: what is left is the Kalman filter's algebra.
+CHOICES = dict(gate=ReprojectionError(np.inf), max_landmarks=CAPACITY, retire=False, linearity_max=0.0, pixel_std_px=0.7)
+SEQUENTIAL, STACKED = FilterConfig(**CHOICES), FilterConfig(update="stacked", **CHOICES)
+K = SEQUENTIAL.max_updates
+QUATERNIONS = slice(3, 7), slice(10, 14)
+
+
+@jax.jit
+def correct(config, state, slot, uv_px, is_measured):
+    """The frame's corrections on the whole state."""
+    submap, rows = gather(state, slot)
+    submap, _ = correct_frame(config, Camera(), submap, uv_px, is_measured)
+    return scatter(config, state, submap, slot, rows)
+
+
+@jax.jit
+def measure(state, slot):
+    """Predicted pixel and its derivative of one slot."""
+    block = Block(state.vehicle, state.landmarks[slot], state.to_coordinates[slot])
+    observation = observe(SEQUENTIAL, Camera(), block)
+    return observation.pixel, observation.H
+
+
+@pytest.fixture(scope="module")
+def problem():
+    """A state in the middle of a run with a random P added, ten of its slots, and their pixels.
+
+    The inverse depths are so large that no correction makes one negative, which the filter would not let stand.
+    """
+    rng = np.random.default_rng(0)
+    recording = head(recorded(seed=5), 40)
+    *_, (state, _) = filtered(FilterConfig(**CHOICES | dict(linearity_max=0.2)), recording)
+    size = VEHICLE + SLOT * state.track_id.shape[0]
+    root = 1e-3 * rng.standard_normal((size, 60))
+    state = with_cov(state, dense_cov(state) + root @ root.T)
+    is_near = state.is_mapped & (state.landmarks[:, -1] > 0.1)
+    slot = rng.permutation(np.flatnonzero(is_near & predict_features(SEQUENTIAL, state, Camera()).is_visible))[:K]
+    assert 0 < state.is_euclidean[slot].sum() < K
+    uv_px = np.stack([measure(state, j)[0] for j in slot]) + rng.standard_normal((K, 2))
+    return state, slot, uv_px
+
+
+def dense_cov(state):
+    """P of vehicle and all slots' error coordinates."""
+    return np.block([[state.P_vv, state.P_vm], [state.P_vm.T, state.P_mm]])
+
+
+def with_cov(state, P):
+    """The state with another P."""
+    blocks = P[:VEHICLE, :VEHICLE], P[:VEHICLE, VEHICLE:], P[VEHICLE:, VEHICLE:]
+    return eqx.tree_at(lambda s: (s.P_vv, s.P_vm, s.P_mm), state, tuple(jnp.asarray(b) for b in blocks))
+
+
+def dense_innovation(state, slot, uv_px):
+    """z (2,) and H (2, N) of one slot."""
+    pixel, block_H = measure(state, slot)
+    H = np.zeros((2, VEHICLE + SLOT * state.track_id.shape[0]))
+    first = VEHICLE + SLOT * slot
+    H[:, :VEHICLE], H[:, first : first + SLOT] = block_H[:, :VEHICLE], block_H[:, VEHICLE:]
+    return uv_px - pixel, H
+
+
+def dense_update(state, z, H):
+    """K = P Hᵀ (H P Hᵀ + R)⁻¹, x + K z, P - K Z Kᵀ on everything, for any number of rows. Equations (9)–(12)."""
+    P = dense_cov(state)
+    Z = H @ P @ H.T + SEQUENTIAL.pixel_std_px**2 * np.eye(len(z))
+    gain = P @ H.T @ np.linalg.inv(Z)
+    shift = gain @ z
+    moved = np.einsum("lij,lj->li", state.to_coordinates, shift[VEHICLE:].reshape(-1, SLOT))
+    state = eqx.tree_at(
+        lambda s: (s.vehicle, s.landmarks), state, (state.vehicle + shift[:VEHICLE], state.landmarks + moved)
+    )
+    return with_cov(state, P - gain @ Z @ gain.T)
+
+
+def dense_normalise(state):
+    """Both quaternions q/|q|, with P by the derivative of that."""
+    vehicle, P = np.array(state.vehicle), dense_cov(state)
+    N = np.eye(len(P))
+    for q in QUATERNIONS:
+        length = np.linalg.norm(vehicle[q])
+        vehicle[q] /= length
+        N[q, q] = (np.eye(4) - np.outer(vehicle[q], vehicle[q])) / length
+    return with_cov(eqx.tree_at(lambda s: s.vehicle, state, jnp.asarray(vehicle)), N @ P @ N.T)
+
+
+def assert_same(state, other, tolerance=1e-12):
+    for name in ("vehicle", "landmarks"):
+        np.testing.assert_allclose(getattr(state, name), getattr(other, name), rtol=0, atol=tolerance)
+    np.testing.assert_allclose(dense_cov(state), dense_cov(other), rtol=0, atol=tolerance)
+
+
+def test_sequential_corrections_are_dense_updates_one_after_another(problem):
+    state, slot, uv_px = problem
+    is_measured = np.arange(K) % 4 != 3
+    expected = state
+    for j in np.flatnonzero(is_measured):
+        expected = dense_update(expected, *dense_innovation(expected, slot[j], uv_px[j]))
+    corrected = correct(SEQUENTIAL, state, slot, uv_px, is_measured)
+    assert_same(corrected, dense_normalise(expected))
+    assert np.abs(corrected.vehicle - state.vehicle).max() > 1e-4  # something happened
+
+
+def test_stacked_correction_is_the_batch_formula(problem):
+    state, slot, uv_px = problem
+    is_measured = np.arange(K) % 4 != 3
+    parts = [dense_innovation(state, slot[j], uv_px[j]) for j in np.flatnonzero(is_measured)]
+    z, H = (np.concatenate(part) for part in zip(*parts, strict=True))
+    expected = dense_normalise(dense_update(state, z, H))
+    assert_same(correct(STACKED, state, slot, uv_px, is_measured), expected)
+
+
+@pytest.mark.parametrize("j", [0, 7])
+def test_stacked_and_sequential_are_one_for_a_single_candidate(problem, j):
+    state, slot, uv_px = problem
+    only = np.arange(K) == j
+    assert_same(correct(STACKED, state, slot, uv_px, only), correct(SEQUENTIAL, state, slot, uv_px, only))
+
+
+def test_stacked_and_sequential_meet_in_the_linear_limit(problem):
+    """All uncertainty and innovations scaled by ε: shifts are of order ε, what re-linearisation changes of order ε²."""
+    state, slot, uv_px = problem
+    predicted = np.stack([measure(state, j)[0] for j in slot])
+    everyone = np.ones(K, bool)
+
+    def relative_difference(scale):
+        small = with_cov(state, scale**2 * dense_cov(state))
+        pixel_std = np.float64(scale * SEQUENTIAL.pixel_std_px)
+        shifts = []
+        for config in (SEQUENTIAL, STACKED):
+            config = eqx.tree_at(lambda c: c.pixel_std_px, config, pixel_std)
+            after = correct(config, small, slot, predicted + scale * (uv_px - predicted), everyone)
+            shifts.append(after.landmarks[slot] - state.landmarks[slot])
+        return np.linalg.norm(shifts[0] - shifts[1]) / np.linalg.norm(shifts[0])
+
+    far, near = relative_difference(1.0), relative_difference(1e-3)
+    assert far > 1e-3
+    assert near < 5e-3 * far
+
+
+def test_an_unmeasured_candidate_changes_nothing_whatever_its_pixel(problem):
+    state, slot, uv_px = problem
+    is_measured = np.arange(K) % 2 == 0
+    hidden = np.where(is_measured[:, None], uv_px, np.nan)
+    for config in (SEQUENTIAL, STACKED):
+        clean = correct(config, state, slot, uv_px, is_measured)
+        jax.tree.map(np.testing.assert_array_equal, correct(config, state, slot, hidden, is_measured), clean)
+    nobody = correct(SEQUENTIAL, state, slot, uv_px, np.zeros(K, bool))
+    assert_same(nobody, dense_normalise(state), tolerance=1e-15)

@@ -1,0 +1,75 @@
+"""Monte-Carlo runs small enough for tests. All tests share their shapes, and so their compilations: one for each gate."""
+
+import dataclasses
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+
+from vcjax.filter.config import FilterConfig
+from vcjax.gates.gate import AbstractGate
+from vcjax.gates.reprojection import ReprojectionError
+from vcjax.gates.virtual_correction import VirtualCorrection
+from vcjax.simulation.scenarios import Scenario, paper
+from vcjax.study import monte_carlo as module
+from vcjax.study.results import PER_FEATURE, PER_FRAME, PER_RUN
+from vcjax.study.sweep import Experiment
+
+NUM_SEEDS = 3
+"""Lanes in a call. A call of another number of lanes is another compilation."""
+NUM_FRAMES = 12
+NUM_FEATURES = 162
+CAPACITIES = {"max_landmarks": 24, "max_updates": 6}
+MEASURES = (*PER_FRAME, *PER_FEATURE, *PER_RUN, "robot", "is_moving")
+"""All that a run is reduced to."""
+# Thresholds so low that a few frames hold recovered, dynamic and inconsistent features.
+STRICT = VirtualCorrection(th1=1.0, th2=0.7)
+
+_compiled = 0
+
+
+def scenario(**options) -> Scenario:
+    """A few frames of one of the paper's scenarios."""
+    return paper(**{"dynamic": "lateral", "num_frames": NUM_FRAMES, **options})
+
+
+def config(gate: AbstractGate | None = None, **options) -> FilterConfig:
+    """A filter with a small map."""
+    return FilterConfig(gate=VirtualCorrection() if gate is None else gate, **{**CAPACITIES, **options})
+
+
+def run_strict(**options):
+    """`monte_carlo` of the default scenario and the strict gate, one call's worth of seeds."""
+    arguments = {"num_seeds": NUM_SEEDS, "key": jax.random.key(7), **options}
+    return module.monte_carlo(scenario(), config(STRICT), **arguments)
+
+
+def tiny_experiment(experiment: Experiment) -> Experiment:
+    """An experiment cut down to a few frames and a small map."""
+    return Experiment(
+        dataclasses.replace(experiment.scenario, num_frames=NUM_FRAMES),
+        dataclasses.replace(experiment.config, **CAPACITIES),
+    )
+
+
+def assert_same_runs(found, expected, **tolerance) -> None:
+    """All measures of two data sets (or mappings of arrays) agree: exactly, unless a tolerance is given."""
+    for name in MEASURES:
+        np.testing.assert_allclose(found[name], expected[name], **{"rtol": 0, **tolerance}, err_msg=name)
+
+
+@contextmanager
+def compilations():
+    """Counts what XLA compiles in a block: `.num` of what it gives, after the block."""
+    counted = SimpleNamespace(num=-_compiled)
+    yield counted
+    counted.num += _compiled
+
+
+def _count(event: str, duration_secs: float, **_) -> None:
+    global _compiled
+    _compiled += event == "/jax/core/compile/backend_compile_duration"
+
+
+jax.monitoring.register_event_duration_secs_listener(_count)
