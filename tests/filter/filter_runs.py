@@ -1,4 +1,4 @@
-"""Filter runs for the tests, frame by frame: one compilation for each static configuration, shared by all test files."""
+"""Filter runs for the tests, frame by frame: one compilation for each static configuration, shared by all files."""
 
 import dataclasses
 from collections.abc import Iterator

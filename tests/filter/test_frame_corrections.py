@@ -19,7 +19,9 @@ from vcjax.gates.reprojection import ReprojectionError
 from vcjax.models.camera import Camera
 
 # No gate and no conversion: what is left is the Kalman filter's algebra.
-CHOICES = dict(gate=ReprojectionError(np.inf), max_landmarks=CAPACITY, retire=False, linearity_max=0.0, pixel_std_px=0.7)
+CHOICES = dict(
+    gate=ReprojectionError(np.inf), max_landmarks=CAPACITY, retire=False, linearity_max=0.0, pixel_std_px=0.7
+)
 SEQUENTIAL, STACKED = FilterConfig(**CHOICES), FilterConfig(update="stacked", **CHOICES)
 K = SEQUENTIAL.max_updates
 QUATERNIONS = slice(3, 7), slice(10, 14)
@@ -105,9 +107,15 @@ def dense_normalise(state):
 
 
 def assert_same(state, other, tolerance=1e-12):
-    for name in ("vehicle", "landmarks"):
-        np.testing.assert_allclose(getattr(state, name), getattr(other, name), rtol=0, atol=tolerance)
-    np.testing.assert_allclose(dense_cov(state), dense_cov(other), rtol=0, atol=tolerance)
+    """Equal but for free slots, which mean nothing."""
+    mapped = np.flatnonzero(state.is_mapped)
+    rows = np.concatenate([np.arange(VEHICLE), (VEHICLE + SLOT * mapped[:, None] + np.arange(SLOT)).ravel()])
+    for ours, theirs in (
+        (state.vehicle, other.vehicle),
+        (state.landmarks[mapped], other.landmarks[mapped]),
+        (dense_cov(state)[np.ix_(rows, rows)], dense_cov(other)[np.ix_(rows, rows)]),
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance)
 
 
 def test_sequential_corrections_are_dense_updates_one_after_another(problem):
@@ -119,6 +127,12 @@ def test_sequential_corrections_are_dense_updates_one_after_another(problem):
     corrected = correct(SEQUENTIAL, state, slot, uv_px, is_measured)
     assert_same(corrected, dense_normalise(expected))
     assert np.abs(corrected.vehicle - state.vehicle).max() > 1e-4  # something happened
+
+
+def test_skipping_free_slots_changes_nothing(problem):
+    everyone = np.ones(K, bool)
+    all_slots = FilterConfig(skip_free_slots=False, **CHOICES)
+    assert_same(correct(SEQUENTIAL, *problem, everyone), correct(all_slots, *problem, everyone), tolerance=1e-14)
 
 
 def test_stacked_correction_is_the_batch_formula(problem):
@@ -163,7 +177,7 @@ def test_an_unmeasured_candidate_changes_nothing_whatever_its_pixel(problem):
     is_measured = np.arange(K) % 2 == 0
     hidden = np.where(is_measured[:, None], uv_px, np.nan)
     for config in (SEQUENTIAL, STACKED):
-        clean = correct(config, state, slot, uv_px, is_measured)
-        jax.tree.map(np.testing.assert_array_equal, correct(config, state, slot, hidden, is_measured), clean)
+        clean, dirty = (correct(config, state, slot, pixels, is_measured) for pixels in (uv_px, hidden))
+        jax.tree.map(np.testing.assert_array_equal, dirty, clean)
     nobody = correct(SEQUENTIAL, state, slot, uv_px, np.zeros(K, bool))
     assert_same(nobody, dense_normalise(state), tolerance=1e-15)

@@ -1,7 +1,7 @@
-"""The filter replays the golden run: same controls and pixels, hence the same choices, numbers and map in all 60 frames.
+"""The filter replays the golden run: same controls and pixels, hence the same choices, numbers and map for 60 frames.
 
-Tolerance: the two implementations order their sums differently; rounding of 1e-16 grows with pixels of 1e3 and through 60
-frames to 1e-11 or so. A wrong formula shows from 1e-6 on. 1e-8 lies between.
+Tolerance: the two implementations order their sums differently; rounding of 1e-16 grows with pixels of 1e3 and through
+60 frames to 1e-11 or so. A wrong formula shows from 1e-6 on. 1e-8 lies between.
 """
 
 import numpy as np

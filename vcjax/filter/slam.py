@@ -15,7 +15,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import choose, match, predict_features
 from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state, slot_count
-from vcjax.filter.submap import gather, scatter
+from vcjax.filter.submap import gather, normalise, scatter
 from vcjax.gates.gate import Evidence
 from vcjax.models.motion import move_by_odometry
 from vcjax.recording import Frame, Recording, validate
@@ -153,6 +153,9 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
     state = initial_state(config, recording, key)
     frame = recording.frame(0)
     state = predict(config, state, frame)
+    # The start's covariance may hold variance along a quaternion, which births must not see.
+    vehicle, N = normalise(config, state.vehicle)
+    state = eqx.tree_at(lambda s: (s.vehicle, s.P_vv), state, (vehicle, N @ state.P_vv @ N.T))
     K, dtype = config.max_updates, state.P_vv.dtype
     nobody, nothing = jnp.zeros(K, bool), jnp.full(K, jnp.nan, dtype)
     info_of_candidates = dict(

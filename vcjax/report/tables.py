@@ -172,7 +172,7 @@ def _cell_rows(table: int, report: _Report) -> list[list[str]]:
     return rows
 
 
-def _printed(number: float) -> str:
+def _printed(number: int | float) -> str:
     """As the paper prints it: counts whole, errors with four decimals."""
     return f"{number:.4f}" if isinstance(number, float) else f"{number}"
 

@@ -87,7 +87,8 @@ def _check_arguments(num_seeds: int, first_seed: int, key: PRNGKeyArray, devices
         key.shape == () if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) else key.shape == (2,)
     )
     if not is_key:
-        raise ValueError(f"monte_carlo(key={key!r}): give one random key, e.g. jax.random.key(0).")
+        found = f"{key.dtype}{list(key.shape)}" if isinstance(key, jax.Array) else repr(key)
+        raise ValueError(f"monte_carlo(key={found}): give one random key, e.g. jax.random.key(0).")
     if devices is not None and len(devices) == 0:
         raise ValueError("monte_carlo(devices=[]): give at least one device, or None for all.")
 

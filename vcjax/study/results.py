@@ -156,8 +156,10 @@ def _read(path: str | os.PathLike, part: Callable[[Any], Any]) -> Any:
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such results file.")
     try:
-        # Opened by h5py first: where that fails, h5netcdf fails too, but leaves an object that complains when it goes.
-        with h5py.File(path), xarray.open_dataset(path, engine="h5netcdf") as dataset:
+        # By h5py first: where that fails, h5netcdf fails too, but leaves an object that complains when it goes.
+        with h5py.File(path) as file:
+            dict(file.attrs)
+        with xarray.open_dataset(path, engine="h5netcdf") as dataset:
             found, result = dataset.attrs.get("schema"), part(dataset)
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise ValueError(f"{path}: not a readable NetCDF-4 file ({error}); remove it and run again.") from error

@@ -1,0 +1,92 @@
+"""Files that are complete or not there."""
+
+import os
+import stat
+
+import pytest
+
+from vcjax.study.storage import check_writable, replacing, write_file
+
+
+def names(folder) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_writes_and_makes_folders(tmp_path):
+    path = tmp_path / "a" / "b" / "note.txt"
+    assert write_file(path, b"one") == path
+    assert path.read_bytes() == b"one"
+    write_file(str(path), b"two")
+    assert path.read_bytes() == b"two" and names(path.parent) == ["note.txt"]
+
+
+def test_file_has_ordinary_permissions(tmp_path):
+    ordinary = tmp_path / "ordinary"
+    ordinary.touch()
+    assert stat.S_IMODE(write_file(tmp_path / "ours", b"").stat().st_mode) == stat.S_IMODE(ordinary.stat().st_mode)
+
+
+def test_old_file_stands_until_the_new_one_is_complete(tmp_path):
+    path = write_file(tmp_path / "note.txt", b"old")
+    with replacing(path) as temporary:
+        temporary.write_bytes(b"half of the n")
+        assert path.read_bytes() == b"old" and temporary.parent == path.parent
+        temporary.write_bytes(b"the new")
+    assert path.read_bytes() == b"the new" and names(tmp_path) == ["note.txt"]
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_failure_leaves_the_old_file_and_nothing_else(tmp_path, failure):
+    path = write_file(tmp_path / "note.txt", b"old")
+
+    def write_half():
+        with replacing(path) as temporary:
+            temporary.write_bytes(b"half")
+            raise failure
+
+    with pytest.raises(failure):
+        write_half()
+    assert path.read_bytes() == b"old" and names(tmp_path) == ["note.txt"]
+
+
+def test_failure_to_rename_leaves_no_temporary_file(tmp_path):
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(OSError, match="taken"):
+        write_file(tmp_path / "taken", b"")
+    assert names(tmp_path) == ["taken"]
+
+
+def test_what_a_killed_process_left_is_removed_and_other_files_are_not(tmp_path):
+    mine, other = ".note[1].txt.abc123.tmp", ".note1.txt.abc123.tmp"
+    for name in (mine, other, "note.tmp"):
+        (tmp_path / name).touch()
+    write_file(tmp_path / "note[1].txt", b"new")
+    assert names(tmp_path) == sorted([other, "note.tmp", "note[1].txt"])
+
+
+def test_place_below_a_file_is_refused_in_one_line(tmp_path):
+    path = write_file(tmp_path / "file", b"old")
+    for place in (path / "below", path / "further" / "below"):
+        for refuse in (check_writable, lambda place: write_file(place, b"")):
+            with pytest.raises(OSError, match="file") as refusal:
+                refuse(place)
+            assert "\n" not in str(refusal.value)
+    assert path.read_bytes() == b"old"
+
+
+def test_writable_places_are_found_so_without_a_trace(tmp_path):
+    path = write_file(tmp_path / "note.txt", b"old")
+    check_writable(path)
+    check_writable(tmp_path / "new" / "note.txt")
+    assert path.read_bytes() == b"old" and names(tmp_path / "new") == []
+    with pytest.raises(IsADirectoryError, match="is a directory; give the name of a file"):
+        check_writable(tmp_path)
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may write everywhere")
+def test_unwritable_folder_is_refused(tmp_path):
+    folder = tmp_path / "locked"
+    folder.mkdir(mode=0o500)
+    for refuse in (check_writable, lambda place: write_file(place, b"")):
+        with pytest.raises(PermissionError, match="locked"):
+            refuse(folder / "note.txt")
