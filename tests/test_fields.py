@@ -17,7 +17,7 @@ class Box(eqx.Module):
     count: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
-        require(self, "width", lambda w: w > 0, "give a positive width.")
+        require(self, "width", lambda w: ~(w <= 0), "give a positive width.")  # a condition that NaN would pass
         require(self, "corner", np.isfinite, "give a place.", length=2)
         require_count(self, "count", 1)
 

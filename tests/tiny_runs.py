@@ -1,4 +1,4 @@
-"""Monte-Carlo runs small enough for tests. All tests share their shapes, and so their compilations: one for each gate."""
+"""Monte-Carlo runs small enough for tests, which share their shapes and so their compilations: one for each gate."""
 
 import dataclasses
 from contextlib import contextmanager
@@ -9,7 +9,6 @@ import numpy as np
 
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.gate import AbstractGate
-from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import Scenario, paper
 from vcjax.study import monte_carlo as module

@@ -157,26 +157,21 @@ def _parse(arguments: list[str]) -> Reproduce | Report | Run:
 def _one_line(box: str) -> str:
     """What the parser says in a box, as one line.
 
-    The box has a title and parts with a rule between them: what is wrong, then what may have been meant, with options
-    at the beginning of lines, and where there is help.
+    The box has a title and parts with rules between them: what is wrong; perhaps what may have been meant, with options
+    at the beginning of lines; where there is help.
     """
     parts: list[list[str]] = [[]]
     for line in box.splitlines():
-        text = line.strip("│╭╮╰╯─ ")
-        if text:
-            parts[-1].append(text)
-        else:
+        text = line.strip("│╭╮╰╯ ")
+        if title := re.fullmatch("─+ (.+) ─+", text):
+            parts += [[title[1]], []]
+        elif set(text) <= set("─-"):
             parts.append([])
-    title, *wrong = parts[0]
-    message = " ".join(wrong or [title])
-    message = re.sub(r"^Error parsing (?!--)\S+: ", "", message)  # a name of the parser's own
-    meant = [
-        text.split()[0]
-        for part in parts
-        if part[:1] == ["Perhaps you meant:"]
-        for text in part
-        if text.startswith("--")
-    ]
+        else:
+            parts[-1].append(text)
+    _, wrong, *more = [part for part in parts if part] if box.count("\n") > 1 else [[], [box.strip()]]
+    message = re.sub(r"^Error parsing (?!--)\S+: ", "", " ".join(wrong))  # a name of the parser's own
+    meant = [text.split()[0] for part in more if part[0] == "Perhaps you meant:" for text in part if text[:2] == "--"]
     return f"{message}; perhaps {' or '.join(meant)}?" if meant else message
 
 

@@ -109,8 +109,8 @@ def validate(recording: Recording) -> None:
     Raises:
         ValueError: naming field, place, value and remedy: shapes that disagree, no frames, times that do not grow, a
             non-finite number where one is needed (pixels count only where valid), negative or repeated ids in a frame,
-            covariances with negative diagonal, quaternions that are not of unit length. Traced recordings are not
-            checked.
+            a last sighting that is not the last, covariances with negative diagonal, quaternions that are not of unit
+            length. Traced recordings are not checked.
     """
     leaves = jax.tree.leaves(recording)
     if not all(is_concrete(leaf) for leaf in leaves):
@@ -149,7 +149,10 @@ def validate(recording: Recording) -> None:
         recording,
         "is marked valid; clear is_valid there.",
     )
-    _refuse_where(is_valid & (track_id < 0), "track_id", recording, "is marked valid; ids start at 0.")
+    is_no_id = (track_id < 0) | (track_id > np.iinfo(np.int32).max)
+    _refuse_where(is_valid & is_no_id, "track_id", recording, "is marked valid; ids start at 0 and end before 2³¹.")
+    reappears = np.asarray(recording.is_last) & is_valid & ~last_sightings(track_id, is_valid)
+    _refuse_where(reappears, "is_last", recording, "its track is seen again; see last_sightings.")
     _refuse_where(np.diff(recording.time_s, prepend=-np.inf) <= 0, "time_s", recording, "times must grow.")
     for name in ("odometry_cov", "start_cov"):
         cov = np.asarray(getattr(recording, name))

@@ -40,7 +40,7 @@ print(json.dumps({
 
 
 def test_float32_is_near_float64(tmp_path):
-    """Rounding of 6e-8 in pixels of 600 is 4e-5 px beside a noise of 1 px, and what hundreds of updates make of it stays
+    """Rounding of 6e-8 in pixels of 600 is 4e-5 px beside a noise of 1 px; what hundreds of updates make of it stays
     far below what the filter knows: a twentieth of a standard deviation.
     """
     recording = head(recorded(seed=6, dynamic="lateral", oscillation_amplitude_m=0.05), NUM_FRAMES)

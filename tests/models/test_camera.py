@@ -24,6 +24,9 @@ both_kinds = pytest.mark.parametrize("camera", [CAMERAS["none"], CAMERAS["two te
 
 project_all = jax.jit(jax.vmap(project, in_axes=(None, 0)))
 back_project_all = jax.jit(jax.vmap(back_project, in_axes=(None, 0)))
+distort_undistorted = jax.jit(jax.vmap(lambda camera, p: distort(camera, undistort(camera, p)), in_axes=(None, 0)))
+derivative_of_projection = jax.jit(jax.jacfwd(project, argnums=1))
+derivative_of_back_projection = jax.jit(jax.jacfwd(back_project, argnums=1))
 
 
 def pixels_over(camera):
@@ -45,8 +48,7 @@ def test_projection_undoes_back_projection_over_the_image(camera):
 def test_undistortion_undoes_distortion(camera):
     pixel = pixels_over(camera)
     point = (pixel - camera.intrinsics_px[:2]) / camera.intrinsics_px[2:]
-    there_and_back = jax.jit(jax.vmap(lambda p: distort(camera, undistort(camera, p))))(point)
-    np.testing.assert_allclose(there_and_back, point, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(distort_undistorted(camera, point), point, rtol=0, atol=1e-13)
 
 
 @given(st.floats(-3, 3), st.floats(-3, 3), st.floats(0.1, 20), st.sampled_from(list(CAMERAS)))
@@ -65,16 +67,15 @@ def test_jacobian_of_projection_is_its_derivative(camera):
     point = jnp.array([0.4, -0.3, 1.7])
     pixel, jacobian = pixel_jacobian(camera, point)
     np.testing.assert_allclose(pixel, project(camera, point), rtol=0, atol=1e-12)
-    exact = jax.jit(jax.jacfwd(project, argnums=1))(camera, point)
-    np.testing.assert_allclose(jacobian, exact, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(jacobian, derivative_of_projection(camera, point), rtol=0, atol=1e-11)
 
 
 @every_camera
 def test_derivative_of_back_projection_inverts_that_of_projection(camera):
     pixel = jnp.array([150.0, 400.0])
     jacobian = pixel_jacobian(camera, back_project(camera, pixel))[1]
-    ray_jacobian = jax.jit(jax.jacfwd(back_project, argnums=1))(camera, pixel)
-    np.testing.assert_allclose(jacobian @ ray_jacobian, np.eye(2), rtol=0, atol=1e-12)
+    round_trip = jacobian @ derivative_of_back_projection(camera, pixel)
+    np.testing.assert_allclose(round_trip, np.eye(2), rtol=0, atol=1e-12)
 
 
 @both_kinds

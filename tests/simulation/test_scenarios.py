@@ -29,6 +29,10 @@ def test_grid_fills_16_by_16_metres_in_two_layers():
     assert places == {(x, y, z) for x in side for y in side for z in (0.0, 1.0)}
 
 
+def test_ids_count_by_layer_then_x_then_y():
+    np.testing.assert_array_equal(grid()[[0, 1, 9, 81]], [[-8, -8, 0], [-8, -6, 0], [-6, -8, 0], [-8, -8, 1]])
+
+
 @pytest.mark.parametrize(
     ("robot", "start", "increment"),
     [

@@ -105,7 +105,7 @@ def test_other_numbers_compile_nothing():
 
 
 def test_seeds_are_paired_across_gates_scenes_and_cameras():
-    """Common random numbers: the first frame holds the odometry's draw only, and all pixels' draws where gates agree."""
+    """Common random numbers: the first frame holds the odometry's draw only; where gates agree, all frames are one."""
 
     def runs(gate, **options):
         return monte_carlo(tiny_runs.scenario(**options), tiny_runs.config(gate), num_seeds=NUM_SEEDS, key=KEY)

@@ -9,7 +9,7 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 
-from vcjax.fields import number, require
+from vcjax.fields import number, require, require_count
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.virtual_correction import VirtualCorrection
@@ -71,9 +71,9 @@ class FilterConfig(eqx.Module):
         for name in ("oscillation_std_m", "linearity_max", "birth_margin_px"):
             require(self, name, lambda v: np.isfinite(v) & (v >= 0), "give a number of at least 0.")
         for name in ("max_landmarks", "max_updates"):
-            require(self, name, lambda n: n >= 1, "give a capacity of at least 1.")
+            require_count(self, name, 1)
         for name in ("births_first_frame", "births_per_frame", "blacklist_capacity"):
-            require(self, name, lambda n: n >= 0, "give a count of at least 0.")
+            require_count(self, name, 0)
         for name, choices in (
             ("update", ("sequential", "stacked")),
             ("choose_among", ("predicted", "measured")),

@@ -19,7 +19,10 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         OSError: if the place cannot be written.
     """
     path = Path(path)
-    _make_folder(path.parent)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(f"{path.parent} is a file; give a place in a directory.") from None
     for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
         leftover.unlink(missing_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
@@ -47,7 +50,7 @@ def write_file(path: str | os.PathLike, content: bytes) -> Path:
 
 
 def check_writable(path: str | os.PathLike) -> None:
-    """Refuse a place that a file cannot be written to, before the work that it is to hold; what is there stays.
+    """Refuse a place that a file cannot be written to, before the work that it is to hold; nothing is left there.
 
     Raises:
         OSError: naming the place and what is wrong with it.
@@ -55,16 +58,11 @@ def check_writable(path: str | os.PathLike) -> None:
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a directory; give the name of a file.")
-    _make_folder(path.parent)
-    with tempfile.TemporaryFile(dir=path.parent):
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    if not folder.is_dir():
+        raise NotADirectoryError(f"{folder} is a file; give a place in a directory.")
+    with tempfile.TemporaryFile(dir=folder):
         pass
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise NotADirectoryError(f"{folder} is a file; give a place in a directory.") from None
 
 
 def _umask() -> int:

@@ -1,0 +1,239 @@
+"""The command line, in this process and tiny: what it writes, what it says, and one clear line for what it refuses."""
+
+import io
+import json
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+import tiny_runs
+import xarray as xr
+from fake_runs import fake_runs
+from tiny_runs import NUM_SEEDS, compilations
+
+import vcjax as vc
+from vcjax.cli import main
+from vcjax.study import monte_carlo as monte_carlo_module
+from vcjax.study import reproduce as reproduce_module
+from vcjax.study.paper import cells
+from vcjax.study.results import SCHEMA, load, save
+from vcjax.study.summary import FIGURES, summarise, summary_text
+
+pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
+SMALL = ["--num-frames", "12", "--seeds", "3", "--max-landmarks", "24", "--max-updates", "6"]
+
+
+def said(capsys) -> tuple[str, str]:
+    """What went to standard output and to standard error."""
+    found = capsys.readouterr()
+    return found.out, found.err
+
+
+@pytest.mark.parametrize("gate", ["RE", "VC"])
+def test_run_prints_a_summary_and_saves_the_runs(gate, tmp_path, capsys):
+    out = tmp_path / "[bold]folder" / "runs.nc"
+    options = ["--gate", gate, "--th1", "4", "--dynamic", "lateral", "--key", "5", "--out", str(out)]
+    assert main(["run", *SMALL, *options, "--oscillation-amplitude-m", "0.05"]) == 0
+    printed, told = said(capsys)
+    runs = load(out)
+    assert printed.strip() == summary_text(summarise(runs)).strip()
+    assert all(label in printed for label in FIGURES.values()) and "3, 0 failed" in printed
+    assert f"wrote {out}" in told
+    config = tiny_runs.config({"RE": vc.ReprojectionError, "VC": vc.VirtualCorrection}[gate](th1=4.0))
+    scenario = tiny_runs.scenario(dynamic_set="ahead", oscillation_amplitude_m=0.05)
+    with compilations() as compiled:
+        expected = vc.monte_carlo(scenario, config, num_seeds=NUM_SEEDS, key=jax.random.key(5))
+    xr.testing.assert_identical(runs, expected)
+    assert compiled.num == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "gate", "th1"),
+    [
+        ([], "VirtualCorrection", 9.0),
+        (["--gate=RE", "--th1=4"], "ReprojectionError", 4.0),
+        (["--gate", "RE", "--gate", "VC", "--th2", "2"], "VirtualCorrection", 9.0),
+        (["--out", "RE"], "VirtualCorrection", 9.0),
+    ],
+)
+def test_gate_is_the_last_one_named(options, gate, th1, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    seen = []
+
+    def monte_carlo(scenario, config, **_):
+        seen.append(config)
+        return fake_runs(num_seeds=2)
+
+    monkeypatch.setattr("vcjax.cli.monte_carlo", monte_carlo)
+    assert main(["run", *options]) == 0
+    assert type(seen[0].gate).__name__ == gate and seen[0].gate.th1 == th1
+    assert len(list(tmp_path.rglob("*"))) >= 1
+
+
+def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
+    seen = []
+    monkeypatch.setattr(
+        "vcjax.cli.monte_carlo", lambda *given, **more: seen.append((*given, more)) or fake_runs(num_seeds=2)
+    )
+    options = "--robot curved --dynamic-set 3 4 5 --noise six_axis --pixel-error-std-px 0.5 --pixel-std-px 2 "
+    options += "--min-searches 7 --no-retire --update stacked --prior predicted --th2 0"
+    assert main(["run", *options.split(), "--out", str(tmp_path / "runs.nc")]) == 0
+    scenario, config, more = seen[0]
+    assert scenario.increment[2] == 0.5 and scenario.odometry_std[2] == 0.005
+    assert np.asarray(scenario.movers.ids).tolist() == [3, 4, 5]
+    assert (scenario.pixel_std_px, config.pixel_std_px) == (0.5, 2.0)
+    assert (config.detector.min_searches, config.retire, config.update) == (7.0, False, "stacked")
+    assert (config.gate.prior, config.gate.th2, more["num_seeds"]) == ("predicted", 0.0, 25)
+
+
+def test_reproduce_then_report(tmp_path, capsys, monkeypatch):
+    whole = reproduce_module.cell_experiment
+    monkeypatch.setattr(reproduce_module, "cells", lambda tables=(2, 3, 4, 5): cells(tables)[:4])
+    monkeypatch.setattr(reproduce_module, "cell_experiment", lambda cell: tiny_runs.tiny_experiment(whole(cell)))
+    monkeypatch.setattr(monte_carlo_module, "MAX_LANES_PER_CALL", NUM_SEEDS)
+    out = tmp_path / "paper"
+    assert main(["reproduce", "--seeds", "3", "--tables", "2", "--out", str(out)]) == 0
+    _, told = said(capsys)
+    written = ["tables.json", "tables.md", "figures/figure_3.png", "figures/figure_3.svg"]
+    assert all(f"wrote {out / name}" in told for name in written)
+    before = {name: (out / name).read_bytes() for name in written}
+    report = json.loads(before["tables.json"])
+    assert report["seeds"] == NUM_SEEDS and len(report["cells"]) == 4
+
+    for name in written:
+        (out / name).unlink()
+    assert main(["report", str(out)]) == 0
+    assert {name: (out / name).read_bytes() for name in written} == before
+    assert main(["reproduce", "--seeds", "3", "--tables", "2", "--key", "1", "--out", str(out)]) == 1
+    assert_one_line(said(capsys)[1].splitlines()[-1], "has other settings (key: ")
+
+
+def assert_one_line(told: str, *words: str) -> None:
+    assert len(told.strip().splitlines()) == 1 and "Traceback" not in told, told
+    assert told.startswith("vcjax: ") and "dummy" not in told, told
+    for word in words:
+        assert word in told, told
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", ["reproduce, report, run", "(see vcjax --help)"]),
+        ("reprot", ["reprot"]),
+        ("report", ["PATH", "(see vcjax report --help)"]),
+        ("report nowhere", ["nowhere: no results", "run `vcjax reproduce` first"]),
+        ("report file", ["file: no results"]),
+        ("reproduce --tables 2 6 --out new", ["no table 6; choose among (2, 3, 4, 5)"]),
+        ("reproduce --tables --out new", ["give at least one of (2, 3, 4, 5)"]),
+        ("reproduce --seeds 0 --out new", ["num_seeds=0", "give at least one seed"]),
+        ("reproduce --out file", ["file"]),
+        ("reproduce --out file/below", ["file"]),
+        ("reproduce --seeds many", ["--seeds", "'many'"]),
+        ("run --out file/below.nc", ["file is a file; give a place in a directory"]),
+        ("run --out folder", ["folder is a directory; give the name of a file"]),
+        ("run --seeds 0", ["num_seeds=0", "give at least one seed"]),
+        ("run --devices 0", ["--devices 0: give at least one device"]),
+        ("run --devices -1", ["--devices -1"]),
+        ("run --key 99999999999999999999", ["--key 99999999999999999999", "64 bits"]),
+        ("run --nonsense 3", ["--nonsense", "(see vcjax run --help)"]),
+        ("run --gate XX", ["'XX'", "--gate", "'RE', 'VC'"]),
+        ("run --gate RE --th2 3", ["--th2", "perhaps --th1?"]),
+        ("run --th1 -1", ["VirtualCorrection(th1=-1.0)", "is positive"]),
+        ("run --gate RE --th1 0", ["ReprojectionError(th1=0.0)", "is positive"]),
+        ("run --th2 nan", ["VirtualCorrection(th2=nan)"]),
+        ("run --oscillation-frequency-hz 5", ["frequency_hz=5.0", "half the frame rate (10.0 Hz)", "lower frequency"]),
+        ("run --oscillation-amplitude-m -0.1", ["amplitude_m=-0.1"]),
+        ("run --num-frames 0", ["num_frames=0", "at least 1"]),
+        ("run --max-updates 0", ["max_updates=0", "at least 1"]),
+        ("run --max-landmarks 8", ["max_updates=10", "max_landmarks=8", "raise max_landmarks"]),
+        ("run --pixel-std-px -1", ["FilterConfig(pixel_std_px=-1.0)", "positive"]),
+        ("run --pixel-error-std-px -1", ["pixel_std_px=-1.0", "at least 0"]),
+        ("run --dynamic-set 1 162", ["162", "there are 162 features, numbered from 0"]),
+        ("run --dynamic-speed-m-s -1 --dynamic lateral", ["speed_m_s=-1.0", "at least 0"]),
+        ("run --robot sideways", ["'sideways'", "--robot", "lateral"]),
+    ],
+)
+def test_what_is_refused_gets_one_clear_line(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("not a folder")
+    (tmp_path / "folder").mkdir()
+    compiled = monte_carlo_module._run_lanes._cache_size()
+    status = main(arguments.split())
+    printed, told = said(capsys)
+    assert status in (1, 2) and printed == "" and monte_carlo_module._run_lanes._cache_size() == compiled
+    assert_one_line(told, *words)
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "folder"}
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
+@pytest.mark.parametrize("columns", ["40", "200"])
+def test_the_parsers_boxes_become_lines_however_they_are_drawn(encoding, columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", columns)
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+        for arguments in ("run --gate RE --th2 3", "run --th1 -1", "", "run --seeds x"):
+            assert main(arguments.split()) == 2
+    unknown, value, nothing, number = said(capsys)[1].splitlines()
+    assert unknown == "vcjax: Unrecognized options: --th2, 3; perhaps --th1? (see vcjax run --help)"
+    assert value.startswith("vcjax: VirtualCorrection(th1=-1.0): a threshold on a squared distance is positive (9.0 is")
+    assert nothing == "vcjax: Expected one of {reproduce, report, run}. (see vcjax --help)"
+    assert number == (
+        "vcjax: Error parsing --seeds: invalid literal for int() with base 10: 'x' (see vcjax run --help)"
+    )
+
+
+def test_damaged_results_get_one_clear_line(tmp_path, capsys):
+    path = tmp_path / "runs" / cells([2])[0].identifier / "seeds_00000-00001.nc"
+    save(fake_runs(num_seeds=2).assign_attrs(schema=SCHEMA), path)
+    path.write_bytes(path.read_bytes()[:3000])
+    assert main(["report", str(tmp_path)]) == 1
+    assert_one_line(said(capsys)[1], str(path), "not a readable NetCDF-4 file")
+
+
+def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vcjax.cli.reproduce", interrupt)
+    assert main(["reproduce", "--out", str(tmp_path)]) == 130
+    assert "stopped; what `vcjax reproduce` has finished is on disk" in said(capsys)[1]
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ([], ["reproduce", "report", "run"]),
+        (["reproduce"], ["--seeds", "--tables", "2 3 4 5", "--out", "--key", "--devices", "the paper: 25"]),
+        (["report"], ["PATH", "Directory of an earlier"]),
+        (["run", "--gate", "RE"], ["--gate {RE,VC}", "--th1", "--min-searches"]),
+        (
+            ["run"],
+            [
+                "--gate {RE,VC}", "--seeds", "--out", "--th1", "--th2", "--prior", "--robot", "--dynamic", "speed, m/s",
+                "--oscillation-amplitude-m", "--oscillation-frequency-hz", "Hz, below half the frame rate", "--noise",
+                "step per frame, m", "--num-frames", "--max-landmarks", "--birth-margin-px", "px; at least 0", "1/m",
+                "--min-corrected-ratio", "(default: 9.0)", "(default: 0.05)",
+            ],
+        ),
+    ],
+)  # fmt: skip
+def test_help_shows_every_option_with_its_unit(command, words, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        main([*command, "--help"])
+    printed, told = said(capsys)
+    assert not stop.value.code and told == ""
+    for word in words:
+        assert word in printed
+    if command[:1] == ["run"]:
+        assert ("--th2" in printed) == ("RE" not in command)
+
+
+def test_installed_command_starts_with_one_line_for_bad_input(tmp_path):
+    """In a process of its own, as people have it: exit status, no traceback, standard output left alone."""
+    command = [sys.executable, "-m", "vcjax", "run", "--devices", "2", "--seeds", "0", "--out", str(tmp_path / "a.nc")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stdout == ""
+    assert_one_line(done.stderr, "num_seeds=0")
