@@ -74,7 +74,7 @@ BAD_VALUES = {
     "NaN pixel marked valid": ("uv_px", np.nan, (2, 3, 1), r"uv_px\[2, 3, 1\] = nan\): is marked valid; clear"),
     "id too large": ("track_id", 2**31, (1, 2), r"track_id\[1, 2\] = 2147483648\): is marked valid; .* end before"),
     "negative id": ("track_id", -2, (1, 2), r"track_id\[1, 2\] = -2\): is marked valid; ids start at 0"),
-    "last seen too early": ("is_last", True, (0, 0), r"is_last\[0, 0\] = True\): its track is seen again"),
+    "last seen too early": ("is_last", True, (0, 1), r"is_last\[0, 1\] = True\): its track is seen again"),
     "repeated id": ("track_id", 12, (1, 2), r"Recording\(track_id\): frame 1 has id 12 twice"),
     "time standing still": ("time_s", 0.2, 2, r"time_s\[2\] = 0.2\): times must grow"),
     "negative odometry variance": ("odometry_cov", -1.0, (4, 5, 5), r"odometry_cov\[4, 5, 5\] = -1.0\): variances"),
