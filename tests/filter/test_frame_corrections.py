@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from filter_runs import CAPACITY, filtered, head, recorded
+from filter_runs import CAPACITY, filtered, head, quick_jit, recorded
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.correction import correct_frame
@@ -27,7 +27,7 @@ K = SEQUENTIAL.max_updates
 QUATERNIONS = slice(3, 7), slice(10, 14)
 
 
-@jax.jit
+@quick_jit
 def correct(config, state, slot, uv_px, is_measured):
     """The frame's corrections on the whole state."""
     submap, rows = gather(state, slot)
@@ -35,7 +35,7 @@ def correct(config, state, slot, uv_px, is_measured):
     return scatter(config, state, submap, slot, rows)
 
 
-@jax.jit
+@quick_jit
 def measure(state, slot):
     """Predicted pixel and its derivative of one slot."""
     block = Block(state.vehicle, state.landmarks[slot], state.to_coordinates[slot])

@@ -4,10 +4,12 @@ Tolerance: the two implementations order their sums differently; rounding of 1e-
 60 frames to 1e-11 or so. A wrong formula shows from 1e-6 on. 1e-8 lies between.
 """
 
+import jax
 import numpy as np
 import pytest
 from filter_runs import filtered, ids, landmarks
 
+from vcjax.filter import slam
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.models.camera import Camera
@@ -49,7 +51,8 @@ def replay(trace):
         start_cov=start_cov,
     )
     config = FilterConfig(gate=ReprojectionError(9.0), max_landmarks=96, retire=False, toolbox_parity=True)
-    return [(info, landmarks(state), counts_by_id(state)) for state, info in filtered(config, recording)]
+    frames = filtered(config, recording, start=jax.jit(slam.start), step=jax.jit(slam.step))  # compiled as for users
+    return [(info, landmarks(state), counts_by_id(state)) for state, info in frames]
 
 
 def counts_by_id(state):

@@ -6,7 +6,20 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from filter_runs import CAPACITY, filtered, head, ids, joint, landmarks, predict, recorded, simulate_once, start, step
+from filter_runs import (
+    CAPACITY,
+    filtered,
+    head,
+    ids,
+    joint,
+    landmarks,
+    predict,
+    quick_jit,
+    recorded,
+    simulate_once,
+    start,
+    step,
+)
 
 from vcjax.filter import slam
 from vcjax.filter.config import FilterConfig
@@ -142,7 +155,7 @@ def test_a_recording_without_any_feature_is_dead_reckoning(recording):
 
 def test_a_seed_that_is_not_finite_is_flagged_and_spoils_no_other(states, recording):
     """A batch of two, one with NaN in its odometry: the other's numbers are the same bit for bit."""
-    batched = jax.jit(jax.vmap(slam.step, in_axes=(None, 0, 0)), compiler_options={"xla_backend_optimization_level": 0})
+    batched = quick_jit(jax.vmap(slam.step, in_axes=(None, 0, 0)))
 
     def run(odometry_of_first):
         pair = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), jax.device_get(states[20]))
