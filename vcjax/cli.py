@@ -2,9 +2,7 @@
 
 import contextlib
 import dataclasses
-import io
 import os
-import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -55,7 +53,7 @@ class Reproduce:
                 num_seeds=self.seeds,
                 tables=self.tables,
                 key=_key(self.key),
-                progress=lambda done, total, cell: show(done, total, cell.identifier),
+                progress=lambda done, total, cell: show(done, total, f"table {cell.table}, {cell.case}, {cell.method}"),
             )
         _report(results, self.out, console)
 
@@ -103,8 +101,8 @@ class Run:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the `vcjax` command; returns its exit status.
 
-    Bad input gives one line on standard error, not a traceback: status 2 where it is refused with the command line,
-    else 1.
+    Bad input gives one line on standard error and status 1, not a traceback. What is wrong with the command line itself
+    the parser says, in a box, and exits with status 2.
     """
     console = Console(stderr=True)
     arguments = list(sys.argv[1:] if arguments is None else arguments)
@@ -112,9 +110,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command = _parse(arguments)
         _use_cores(getattr(command, "devices", None))
         command(console)
-    except _UsageError as error:
-        _say(console, f"vcjax: {error}", style="bold red")
-        return 2
     except (ValueError, OSError, ModuleNotFoundError) as error:
         _say(console, f"vcjax: {error}", style="bold red")
         return 1
@@ -122,10 +117,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(console, "vcjax: stopped; what `vcjax reproduce` has finished is on disk, and it will go on from there.")
         return 130
     return 0
-
-
-class _UsageError(Exception):
-    """A command line that cannot be understood, or names values that are refused."""
 
 
 def _parse(arguments: list[str]) -> Reproduce | Report | Run:
@@ -137,42 +128,13 @@ def _parse(arguments: list[str]) -> Reproduce | Report | Run:
         | Annotated[Report, tyro.conf.subcommand("report")]
         | Annotated[Run, tyro.conf.subcommand("run", default=default)]
     )
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint):
-            return tyro.cli(
-                union,  # type: ignore[arg-type]
-                args=arguments,
-                prog="vcjax",
-                description="Which image features belong to moving things, and how should a camera move to find out?",
-                config=(tyro.conf.OmitArgPrefixes,),
-            )
-    except SystemExit as stop:
-        if not stop.code:  # --help
-            raise
-        about = next((f" {name}" for name in arguments[:1] if name in ("reproduce", "report", "run")), "")
-        raise _UsageError(f"{_one_line(complaint.getvalue())} (see vcjax{about} --help)") from None
-
-
-def _one_line(box: str) -> str:
-    """What the parser says in a box, as one line.
-
-    The box has a title and parts with rules between them: what is wrong; perhaps what may have been meant, with options
-    at the beginning of lines; where there is help.
-    """
-    parts: list[list[str]] = [[]]
-    for line in box.splitlines():
-        text = line.strip("│╭╮╰╯ ")
-        if title := re.fullmatch("─+ (.+) ─+", text):
-            parts += [[title[1]], []]
-        elif set(text) <= set("─-"):
-            parts.append([])
-        else:
-            parts[-1].append(text)
-    _, wrong, *more = [part for part in parts if part] if box.count("\n") > 1 else [[], [box.strip()]]
-    message = re.sub(r"^Error parsing (?!--)\S+: ", "", " ".join(wrong))  # a name of the parser's own
-    meant = [text.split()[0] for part in more if part[0] == "Perhaps you meant:" for text in part if text[:2] == "--"]
-    return f"{message}; perhaps {' or '.join(meant)}?" if meant else message
+    return tyro.cli(
+        union,  # type: ignore[arg-type]
+        args=arguments,
+        prog="vcjax",
+        description="Which image features belong to moving things, and how should a camera move to find out?",
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
 
 
 def _gate_name(arguments: list[str]) -> str:
@@ -219,7 +181,7 @@ def _progress(console: Console, description: str) -> Iterator[Callable[..., None
 
     When the work is refused, the bar goes, so that what is wrong stands alone.
     """
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (BarColumn(16), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     bar = Progress(TextColumn("{task.description}"), *columns, console=console)
     task = bar.add_task(description, total=None)
 

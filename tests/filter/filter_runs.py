@@ -6,6 +6,7 @@ from functools import cache, partial
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vcjax.filter import slam
@@ -29,10 +30,9 @@ def known(options: dict) -> dict:
     return options
 
 
-# Compiles the filter in a quarter of the time; on one recording it then runs as fast.
-quick_jit = partial(
-    jax.jit, compiler_options=known({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
-)
+QUICK = known({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
+"""XLA compiles the filter in a quarter of the time; on one recording it then runs as fast."""
+quick_jit = partial(jax.jit, compiler_options=QUICK)
 start, step, predict = quick_jit(slam.start), quick_jit(slam.step), quick_jit(slam.predict)
 simulate_once = quick_jit(simulate)
 
@@ -51,7 +51,14 @@ def step_jvp(primals, tangents):
 
 def zero_tangent(tree):
     """A tangent of zeros, None where a leaf is no real number."""
-    return jax.tree.map(lambda x: np.zeros_like(x) if eqx.is_inexact_array_like(x) else None, tree)
+    is_real = partial(jnp.issubdtype, arg2=jnp.inexact)
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype) if is_real(x.dtype) else None, tree)
+
+
+def derivative(function, value, tangent):
+    """function(value) and its derivative, with zeros where there is none."""
+    out, d_out = eqx.filter_jvp(function, (value,), (tangent,))
+    return out, eqx.combine(d_out, zero_tangent(out))
 
 
 @cache

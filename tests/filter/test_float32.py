@@ -11,7 +11,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from filter_runs import CAPACITY, filtered, head, recorded
+from filter_runs import CAPACITY, QUICK, filtered, head, recorded
 
 from vcjax.filter.config import FilterConfig
 
@@ -26,9 +26,11 @@ from vcjax.filter.slam import run
 from vcjax.models.camera import Camera
 from vcjax.recording import Recording
 
-with np.load(sys.argv[1]) as arrays:
+path, capacity, options = sys.argv[1:]
+with np.load(path) as arrays:
     recording = Recording(camera=Camera(), **arrays)
-state, info = run(FilterConfig(max_landmarks=int(sys.argv[2]), retire=False), recording)
+config = FilterConfig(max_landmarks=int(capacity), retire=False)
+state, info = jax.jit(run, compiler_options=json.loads(options))(config, recording)
 print(json.dumps({
     "dtypes": sorted({str(leaf.dtype) for leaf in jax.tree.leaves((state, info))}),
     "is_finite": bool(np.all(info.is_finite)),
@@ -48,7 +50,7 @@ def test_float32_is_near_float64(tmp_path):
     single = {name: np.float32(a) if a.dtype == np.float64 else a for name, a in arrays.items()}
     np.savez(tmp_path / "recording.npz", **single)
     finished = subprocess.run(
-        [sys.executable, "-c", IN_FLOAT32, str(tmp_path / "recording.npz"), str(CAPACITY)],
+        [sys.executable, "-c", IN_FLOAT32, str(tmp_path / "recording.npz"), str(CAPACITY), json.dumps(QUICK)],
         env=os.environ | {"JAX_ENABLE_X64": "0", "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,

@@ -141,7 +141,7 @@ def test_missing_cells_leave_out_what_needs_them(tmp_path):
 def test_nothing_to_report_and_unequal_seeds_are_refused():
     with pytest.raises(ValueError, match="run at least one cell"):
         tables({})
-    with pytest.raises(ValueError, match="different numbers of seeds.*table2_forward_static_RE_steady': 3"):
+    with pytest.raises(ValueError, match=r"different numbers of seeds.*table2_forward_static_RE_steady': 3"):
         tables({RE: fake_runs(RE, 3), VC: fake_runs(VC, 4)})
 
 

@@ -35,6 +35,13 @@ def test_old_file_stands_until_the_new_one_is_complete(tmp_path):
     assert path.read_bytes() == b"the new" and names(tmp_path) == ["note.txt"]
 
 
+def test_who_reads_the_old_file_reads_it_to_its_end(tmp_path):
+    path = write_file(tmp_path / "note.txt", b"old")
+    with path.open("rb") as reader:
+        write_file(path, b"new and longer")
+        assert reader.read() == b"old"
+
+
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
 def test_failure_leaves_the_old_file_and_nothing_else(tmp_path, failure):
     path = write_file(tmp_path / "note.txt", b"old")

@@ -95,6 +95,8 @@ def test_paths_reach_every_number_and_nothing_else():
     assert not any("movers.ids" in path for path in paths)
     base = experiment(oscillation_frequency_hz=0.1)
     for path in paths:  # every one of them can be replaced, by one number as well as by several
+        if "direction" in path:  # which is of unit length: no element changes alone
+            continue
         replace_at(base, {path: np.float64(0.25)})
         replace_at(base, {path: np.array([0.25, 0.3])})
 
