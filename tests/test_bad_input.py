@@ -15,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
 
 @pytest.fixture(scope="module")
 def recording():
-    recording, _ = jax.jit(vc.simulate)(tiny_runs.scenario(), jax.random.key(0))
+    recording, _ = tiny_runs.simulate_once(tiny_runs.scenario(), jax.random.key(0))
     return jax.device_get(recording)
 
 

@@ -6,11 +6,14 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
+from quick import QUICK
 
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.slam import run
 from vcjax.gates.gate import AbstractGate
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import Scenario, paper
+from vcjax.simulation.simulate import simulate
 from vcjax.study import monte_carlo as module
 from vcjax.study.results import PER_FEATURE, PER_FRAME, PER_RUN
 from vcjax.study.sweep import Experiment
@@ -25,6 +28,12 @@ MEASURES = (*PER_FRAME, *PER_FEATURE, *PER_RUN, "robot", "is_moving")
 """All that a run is reduced to."""
 # Thresholds so low that a few frames hold recovered, dynamic and inconsistent features.
 STRICT = VirtualCorrection(th1=1.0, th2=0.7)
+
+simulate_once, run_once = jax.jit(simulate, compiler_options=QUICK), jax.jit(run, compiler_options=QUICK)
+# The inside of `monte_carlo` as it is, but compiled quickly.
+module._run_lanes = jax.jit(
+    module._run_lanes.__wrapped__, static_argnames=("mesh", "batch_size"), compiler_options=QUICK
+)
 
 _compiled = 0
 

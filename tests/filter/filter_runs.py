@@ -8,12 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from quick import QUICK
 
 from vcjax.filter import slam
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.slam import FrameInfo
 from vcjax.filter.state import SLOT, VEHICLE, FilterState, full_cov, landmark_cov
-from vcjax.recording import Recording
+from vcjax.recording import Frame, Recording
 from vcjax.simulation.scenarios import paper
 from vcjax.simulation.simulate import simulate
 
@@ -21,32 +22,9 @@ CAPACITY = 112
 """Slots enough for every landmark that 160 frames of the paper's scenarios give birth to."""
 
 
-def known(options: dict) -> dict:
-    """The options, or none where this version of XLA does not know them all."""
-    try:
-        jax.jit(lambda x: x, compiler_options=options)(0.0)
-    except jax.errors.JaxRuntimeError:
-        return {}
-    return options
-
-
-QUICK = known({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
-"""XLA compiles the filter in a quarter of the time; on one recording it then runs as fast."""
 quick_jit = partial(jax.jit, compiler_options=QUICK)
 start, step, predict = quick_jit(slam.start), quick_jit(slam.step), quick_jit(slam.predict)
 simulate_once = quick_jit(simulate)
-
-
-@quick_jit
-def start_jvp(primals, tangents):
-    """Derivative of (config, recording) -> (state, info); None is the tangent of what is no real number."""
-    return eqx.filter_jvp(slam.start, primals, tangents)
-
-
-@quick_jit
-def step_jvp(primals, tangents):
-    """Derivative of (config, state, frame) -> (state, info)."""
-    return eqx.filter_jvp(slam.step, primals, tangents)
 
 
 def zero_tangent(tree):
@@ -55,10 +33,14 @@ def zero_tangent(tree):
     return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype) if is_real(x.dtype) else None, tree)
 
 
-def derivative(function, value, tangent):
-    """function(value) and its derivative, with zeros where there is none."""
-    out, d_out = eqx.filter_jvp(function, (value,), (tangent,))
+def derivative(function, primals: tuple, tangents: tuple):
+    """function(*primals) and its derivative, a tangent with a zero for every real number that has none."""
+    out, d_out = eqx.filter_jvp(function, primals, tangents)
     return out, eqx.combine(d_out, zero_tangent(out))
+
+
+start_jvp = quick_jit(partial(derivative, slam.start))
+step_jvp = quick_jit(partial(derivative, slam.step))
 
 
 @cache
@@ -68,11 +50,21 @@ def recorded(seed: int, **scenario) -> Recording:
     return jax.device_get(recording)
 
 
-def head(recording: Recording, num_frames: int) -> Recording:
-    """The first frames of a recording. (`is_last` still tells of the whole.)"""
+def part(recording: Recording, first: int, end: int) -> Recording:
+    """Frames first ≤ t < end of a recording. (`is_last` still tells of the whole.)"""
     once = ("camera", "robot_start", "sensor_start", "start_cov")
-    fields = {k: v if k in once else v[:num_frames] for k, v in vars(recording).items()}
+    fields = {k: v if k in once else v[first:end] for k, v in vars(recording).items()}
     return dataclasses.replace(recording, **fields)
+
+
+def head(recording: Recording, num_frames: int) -> Recording:
+    """The first frames of a recording."""
+    return part(recording, 0, num_frames)
+
+
+def frame_of(recording: Recording, t: int) -> Frame:
+    """Frame t. Cut out before it goes to the device, so that recordings of all lengths share what that compiles."""
+    return part(recording, t, t + 1).frame(0)
 
 
 def filtered(
@@ -82,7 +74,7 @@ def filtered(
     state, info = start(config, head(recording, 1), key)
     yield state, jax.device_get(info)
     for t in range(1, recording.num_frames):
-        state, info = step(config, state, recording.frame(t))
+        state, info = step(config, state, frame_of(recording, t))
         yield state, jax.device_get(info)
 
 

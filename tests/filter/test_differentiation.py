@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from filter_runs import CAPACITY, derivative, filtered, head, quick_jit, start_jvp, step_jvp
+from filter_runs import CAPACITY, derivative, filtered, frame_of, head, quick_jit, start_jvp, step_jvp
 
 from vcjax.filter import slam
 from vcjax.filter.config import FilterConfig
@@ -47,7 +47,7 @@ inputs_once = quick_jit(inputs)
 
 @quick_jit
 def inputs_jvp(parameters, direction, sees):
-    return derivative(lambda p: inputs(p, sees), parameters, direction)
+    return derivative(lambda p: inputs(p, sees), (parameters,), (direction,))
 
 
 def summary(vehicle, vehicle_cov):
@@ -58,10 +58,10 @@ def summary(vehicle, vehicle_cov):
 def forward(direction, sees=True):
     """State, info and their derivatives of the last frame, by forward mode through every frame."""
     (config, recording), (d_config, d_recording) = inputs_jvp(AT, direction, sees)
-    first, d_first = derivative(lambda r: head(r, 1), recording, d_recording)
+    first, d_first = derivative(lambda r: head(r, 1), (recording,), (d_recording,))
     (state, info), (d_state, d_info) = start_jvp((config, first), (d_config, d_first))
     for t in range(1, NUM_FRAMES):
-        frame, d_frame = derivative(lambda r, t=t: r.frame(t), recording, d_recording)
+        frame, d_frame = derivative(lambda r, t=t: frame_of(r, t), (recording,), (d_recording,))
         (state, info), (d_state, d_info) = step_jvp((config, state, frame), (d_config, d_state, d_frame))
     return state, info, d_state, d_info
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from filter_runs import CAPACITY, filtered, head, ids, joint, recorded, start, step
+from filter_runs import CAPACITY, filtered, frame_of, head, ids, joint, recorded, start, step
 
 from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig
@@ -180,7 +180,7 @@ def test_deletion_is_marginalisation(recording):
         deleted,
         (np.where(rows, 0.0, deleted.P_vm), np.where(rows | rows[:, None], 0.0, deleted.P_mm)),
     )
-    (after, info), (after_wiped, info_wiped) = (step(VC, s, recording.frame(30)) for s in (deleted, wiped))
+    (after, info), (after_wiped, info_wiped) = (step(VC, s, frame_of(recording, 30)) for s in (deleted, wiped))
     jax.tree.map(np.testing.assert_array_equal, info, info_wiped)
     still = ids(after.track_id)
     for ours, theirs in zip(joint(after, still), joint(after_wiped, still), strict=True):

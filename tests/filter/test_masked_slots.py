@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from filter_runs import CAPACITY, filtered, head, ids, joint, recorded, step, step_jvp, zero_tangent
+from filter_runs import CAPACITY, filtered, frame_of, head, ids, joint, recorded, step, step_jvp, zero_tangent
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.state import VEHICLE
@@ -84,7 +84,7 @@ def test_the_state_has_landmarks_and_the_frames_have_events(state, recording):
     """Otherwise the tests below would show nothing."""
     births, isolated = 0, 0
     for t in range(FROM, TO):
-        state, info = step(VC, state, recording.frame(t))
+        state, info = step(VC, state, frame_of(recording, t))
         births += len(ids(info.born_id))
         isolated += np.isfinite(info.re2).sum()
     assert births == TO - FROM
@@ -94,8 +94,8 @@ def test_the_state_has_landmarks_and_the_frames_have_events(state, recording):
 def test_values_are_the_same_bit_for_bit(state, cluttered, recording, littered):
     dirty = cluttered
     for t in range(FROM, TO):
-        state, info = step(VC, state, recording.frame(t))
-        dirty, dirty_info = step(VC, dirty, littered.frame(t))
+        state, info = step(VC, state, frame_of(recording, t))
+        dirty, dirty_info = step(VC, dirty, frame_of(littered, t))
         assert_identical(dirty_info, info)
         assert_identical(visible_part(dirty), visible_part(state))
     assert np.abs(dirty.landmarks).max() > 1e20  # the clutter is still there
@@ -121,7 +121,7 @@ def with_tangents(name, state, recording):
     """State, info and their derivatives through the frames, in one direction."""
     d_state = zero_tangent(state)
     for t in range(FROM, FROM + 3):
-        frame = recording.frame(t)
+        frame = frame_of(recording, t)
         d_config, d_frame = DIRECTIONS[name](zero_tangent(VC), zero_tangent(frame))
         (state, info), (d_state, d_info) = step_jvp((VC, state, frame), (d_config, d_state, d_frame))
     return state, info, d_state, d_info

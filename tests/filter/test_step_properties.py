@@ -9,6 +9,7 @@ import pytest
 from filter_runs import (
     CAPACITY,
     filtered,
+    frame_of,
     head,
     ids,
     joint,
@@ -87,14 +88,14 @@ def test_quaternions_are_of_unit_length_after_every_frame(states):
 def test_a_measurement_never_adds_uncertainty(states, recording):
     """The variance of what a frame corrects is at most what its prediction left."""
     for t in (5, 20, 39):
-        predicted = predict(VC, states[t - 1], recording.frame(t))
+        predicted = predict(VC, states[t - 1], frame_of(recording, t))
         reduction = np.asarray(predicted.P_vv - states[t].P_vv)[:3, :3]
         assert np.linalg.eigvalsh(reduction)[0] > -1e-15
 
 
 def test_slots_have_no_meaning(states, recording):
     """The same landmarks in other slots give the same frame, to rounding of re-ordered sums."""
-    state, frame = jax.device_get(states[30]), recording.frame(31)
+    state, frame = jax.device_get(states[30]), frame_of(recording, 31)
     order = np.arange(len(state.track_id))
     order[:CAPACITY] = np.random.default_rng(1).permutation(CAPACITY)  # the slots behind are spare, always free
     rows = (7 * order[:, None] + np.arange(7)).ravel()
@@ -135,7 +136,7 @@ def test_frames_without_a_feature_are_predictions(states, recording):
             assert ids(info.candidate_id)  # searched
             assert not info.is_measured.any()
             assert not ids(info.born_id)
-            predicted = predict(VC, before, dark.frame(t))
+            predicted = predict(VC, before, frame_of(dark, t))
             np.testing.assert_allclose(state.vehicle, predicted.vehicle, rtol=0, atol=1e-14)
             np.testing.assert_allclose(state.P_vv, predicted.P_vv, rtol=0, atol=1e-16)
             for i, (_, mean, _) in landmarks(state).items():
@@ -160,7 +161,7 @@ def test_a_seed_that_is_not_finite_is_flagged_and_spoils_no_other(states, record
     def run(odometry_of_first):
         pair = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), jax.device_get(states[20]))
         for t in range(21, 25):
-            frame = jax.device_get(recording.frame(t))
+            frame = jax.device_get(frame_of(recording, t))
             first = eqx.tree_at(lambda f: f.odometry, frame, odometry_of_first(frame.odometry))
             pair, info = batched(VC, pair, jax.tree.map(lambda *leaves: np.stack(leaves), first, frame))
         return jax.device_get((pair, info))

@@ -8,15 +8,14 @@ import pytest
 import tiny_runs
 from scipy.spatial.transform import Rotation
 
-import vcjax as vc
 from vcjax.study.metrics import run_metrics, trajectory_errors
 
 
 @pytest.fixture(scope="module")
 def run_and_truth():
     """Info and truth of a run in which features were recovered and called dynamic, and some more invented deletions."""
-    recording, truth = jax.jit(vc.simulate)(tiny_runs.scenario(), jax.random.key(3))
-    _, info = vc.run(tiny_runs.config(tiny_runs.STRICT), recording)
+    recording, truth = tiny_runs.simulate_once(tiny_runs.scenario(), jax.random.key(3))
+    _, info = tiny_runs.run_once(tiny_runs.config(tiny_runs.STRICT), recording)
     info, truth = jax.device_get((info, truth))
     random = np.random.default_rng(0)
     ids = np.where(random.random(info.inconsistent_id.shape) < 0.1, random.integers(0, 20, info.track_id.shape), -1)

@@ -1,7 +1,6 @@
 """Monte Carlo in one call: equal to single runs, whatever their grouping; paired seeds; compiled once; failed seeds."""
 
 import json
-import os
 import subprocess
 import sys
 from functools import cache
@@ -13,7 +12,18 @@ import numpy as np
 import pytest
 import tiny_runs
 from jax.sharding import Mesh
-from tiny_runs import MEASURES, NUM_FEATURES, NUM_FRAMES, NUM_SEEDS, STRICT, assert_same_runs, compilations, run_strict
+from tiny_runs import (
+    MEASURES,
+    NUM_FEATURES,
+    NUM_FRAMES,
+    NUM_SEEDS,
+    STRICT,
+    assert_same_runs,
+    compilations,
+    run_once,
+    run_strict,
+    simulate_once,
+)
 
 import vcjax as vc
 from vcjax.study import monte_carlo as module
@@ -32,15 +42,12 @@ def strict_runs():
     return run_strict()
 
 
-simulate_once = jax.jit(vc.simulate)
-
-
 def test_equals_single_runs_one_after_another():
     scenario, config = tiny_runs.scenario(), tiny_runs.config(STRICT)
     runs = strict_runs()
     for seed in range(NUM_SEEDS):
         recording, truth = simulate_once(scenario, jax.random.fold_in(KEY, seed))
-        _, info = vc.run(config, recording)
+        _, info = run_once(config, recording)
         single = run_metrics(info, truth)
         assert set(single) == set(MEASURES)
         found = runs.isel(seed=seed)
@@ -151,12 +158,7 @@ def test_failed_seed_is_flagged_counted_and_spoils_no_other(monkeypatch):
     monkeypatch.setattr(module, "simulate", simulate)
     experiment = Experiment(tiny_runs.scenario(), tiny_runs.config(STRICT))
     mesh = Mesh(np.array(jax.local_devices()[:1]), ("lane",))
-    quickly = jax.jit(
-        module._run_lanes.__wrapped__,
-        static_argnames=("mesh", "batch_size"),
-        compiler_options={"xla_backend_optimization_level": 0},
-    )
-    lanes = quickly(experiment, {}, jnp.arange(NUM_SEEDS, dtype=jnp.uint32), KEY, mesh, NUM_SEEDS)
+    lanes = module._run_lanes(experiment, {}, jnp.arange(NUM_SEEDS, dtype=jnp.uint32), KEY, mesh, NUM_SEEDS)
     assert lanes["is_finite"].tolist() == [seed != bad_seed for seed in range(NUM_SEEDS)]
 
     runs, good = strict_runs(), [0, 2]
@@ -183,8 +185,7 @@ def test_number_of_devices_makes_no_difference(tmp_path):
         np.savez({str(tmp_path / "two.npz")!r}, seed=runs.seed, **{{name: runs[name] for name in MEASURES}})
     """
     lines = "\n".join(line.strip() for line in script.splitlines())
-    environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}  # compiles in half the time
-    subprocess.run([sys.executable, "-c", lines], check=True, env=environment)
+    subprocess.run([sys.executable, "-c", lines], check=True)
     with np.load(tmp_path / "two.npz") as two:
         np.testing.assert_array_equal(two["seed"], strict_runs().seed)
         assert_same_runs(two, strict_runs(), **ROUNDING)
