@@ -39,7 +39,9 @@ class FilterConfig(eqx.Module):
     birth_order: Literal["lowest_id", "random"] = eqx.field(static=True, default="lowest_id")
     """Which feature is initialised first: the lowest id, or a random order from the run's own key."""
     retire: bool = eqx.field(static=True, default=True)
-    """Free the slot of a landmark after its track's last measurement in the recording: exact for everything else."""
+    """Free the slot of a landmark after its track's last measurement in the recording. Exact for everything that stays
+    if landmarks are chosen among the measured; among the predicted, a landmark that is predicted but never measured
+    again no longer uses up one of the places for update, nor does the detector see it."""
     blacklist_capacity: int = eqx.field(static=True, default=0)
     """How many deleted features are remembered and never born again; 0: a deleted feature may come back."""
     skip_free_slots: bool = eqx.field(static=True, default=True)

@@ -149,7 +149,11 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
         key: for a random order of births, and only then.
 
     Returns: the state after the first frame, and its info.
+
+    Raises:
+        ValueError: for a recording that no filter can run on (see `recording.validate`).
     """
+    validate(recording)
     state = initial_state(config, recording, key)
     frame = recording.frame(0)
     state = predict(config, state, frame)

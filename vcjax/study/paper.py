@@ -147,7 +147,7 @@ Region = tuple[float, float]
 LOWER: Region = (-math.inf, 0.0)
 HIGHER: Region = (0.0, math.inf)
 SIXTEEN_OR_SEVENTEEN: Region = (15.5, 17.5)  # rounds to one of them
-NONE: Region = (-math.inf, 0.5)  # rounds to zero features per run
+NONE: Region = (-math.inf, 0.5)  # rounds to zero per run
 SOME: Region = (0.5, math.inf)
 SAME_COUNT: Region = (-1.5, 1.5)  # rounds to a difference of at most one, as in the paper
 SIMILAR_CM: Region = (-0.5, 0.5)  # the paper's own errors differ by 0.2 cm
@@ -194,6 +194,8 @@ _THAN_AT_1_M_S: tuple[_Statement, ...] = (
     ),
 )
 _INVERSE_FORWARD: tuple[_Statement, ...] = (
+    ("RE steady has no dynamic event", "dynamic_events_per_run", RE, None, NONE),
+    ("VC steady has no dynamic event", "dynamic_events_per_run", VC, None, NONE),
     ("RE steady finds no mover", "dynamic_found_per_run", RE, None, NONE),
     ("VC steady finds no mover", "dynamic_found_per_run", VC, None, NONE),
     ("oscillation raises VC's dynamic events", "dynamic_events_per_run", VC_OSCILLATING, VC, HIGHER),
