@@ -59,12 +59,14 @@ def cluttered(state):
 
 @pytest.fixture(scope="module")
 def littered(recording):
-    """The same recording with NaN pixels and ids of other features where nothing is valid."""
+    """The same recording with NaN pixels and ids of features in the map where nothing is valid."""
     is_invalid = ~recording.is_valid
-    shifted = np.roll(recording.track_id, 7, axis=1)
+    track_id = recording.track_id.copy()
+    for row, invalid in zip(track_id, is_invalid, strict=True):
+        row[invalid] = np.resize(row[~invalid], invalid.sum())
     return dataclasses.replace(
         recording,
-        track_id=np.where(is_invalid, shifted, recording.track_id),
+        track_id=track_id,
         uv_px=np.where(is_invalid[..., None], np.nan, recording.uv_px),
         is_last=recording.is_last | is_invalid,
     )
