@@ -23,7 +23,7 @@ class FilterConfig(eqx.Module):
     detector: AbstractDetector = eqx.field(default_factory=InlierRatio)
     """Which landmarks are deleted over time."""
 
-    max_landmarks: int = eqx.field(static=True, default=96)
+    max_landmarks: int = eqx.field(static=True, default=111)
     """Landmark slots. A full map is reported, and no feature is born until a slot is free."""
     max_updates: int = eqx.field(static=True, default=10)
     """Landmarks corrected per frame (Table 1: 10)."""
@@ -39,9 +39,10 @@ class FilterConfig(eqx.Module):
     birth_order: Literal["lowest_id", "random"] = eqx.field(static=True, default="lowest_id")
     """Which feature is initialised first: the lowest id, or a random order from the run's own key."""
     retire: bool = eqx.field(static=True, default=True)
-    """Free the slot of a landmark after its track's last measurement in the recording. Exact for everything that stays
-    if landmarks are chosen among the measured; among the predicted, a landmark that is predicted but never measured
-    again no longer uses up one of the places for update, nor does the detector see it."""
+    """Free the slot of a landmark whose track has ended in the recording, as soon as nothing depends on it any more:
+    at once if landmarks are chosen among the measured; among the predicted, where it may still use up a place for
+    update or be deleted by the detector, once it is predicted far outside the image. Exact for everything that
+    stays."""
     blacklist_capacity: int = eqx.field(static=True, default=0)
     """How many deleted features are remembered and never born again; 0: a deleted feature may come back."""
     skip_free_slots: bool = eqx.field(static=True, default=True)

@@ -22,12 +22,18 @@ class Block(NamedTuple):
     to_coordinates: Float[Array, "7 7"]
 
 
+NEAR_PX = 64.0
+"""How far outside the image a landmark may be predicted that soon may be predicted inside again."""
+
+
 class Observation(NamedTuple):
     """A predicted measurement."""
 
     pixel: Float[Array, "*b 2"]
     is_visible: Bool[Array, "*b"]
     """Inside the image and in front of the camera."""
+    is_near: Bool[Array, "*b"]
+    """Visible or almost so: at most `NEAR_PX` outside the image."""
     H: Float[Array, "*b 2 21"]
     """Derivative of the pixel by the errors of vehicle and slot."""
 
@@ -44,7 +50,10 @@ def observe(config: FilterConfig, camera: Camera, block: Block) -> Observation:
     H = jnp.concatenate(
         [U_r[:, :3], U_r[:, 3:] @ robot_H, U_s[:, :3], U_s[:, 3:] @ sensor_H, U_l @ block.to_coordinates], axis=1
     )
-    return Observation(pixel, is_inside(camera, pixel) & (depth > 0), H)
+    is_in_front = depth > 0
+    return Observation(
+        pixel, is_inside(camera, pixel) & is_in_front, is_inside(camera, pixel, -NEAR_PX) & is_in_front, H
+    )
 
 
 def retract(config: FilterConfig, block: Block, shift: Float[Array, "21"]) -> Block:
@@ -77,6 +86,8 @@ class Prediction(NamedTuple):
 
     is_visible: Bool[Array, " L"]
     """Mapped and predicted inside the image."""
+    is_near: Bool[Array, " L"]
+    """Mapped and predicted inside the image or near it."""
     uncertainty: Float[Array, " L"]
     """det(H P Hᵀ), px⁴."""
 
@@ -97,7 +108,7 @@ def predict_features(config: FilterConfig, state: FilterState, camera: Camera) -
     E = jnp.einsum("lav,vw,lbw->lab", H_v, state.P_vv, H_v)
     E = E + cross + cross.mT + jnp.einsum("lai,lij,lbj->lab", H_l, slot_blocks(state), H_l)
     uncertainty = E[:, 0, 0] * E[:, 1, 1] - E[:, 0, 1] * E[:, 1, 0]
-    return Prediction(is_mapped & observation.is_visible, uncertainty)
+    return Prediction(is_mapped & observation.is_visible, is_mapped & observation.is_near, uncertainty)
 
 
 def match(state: FilterState, track_id: Int[Array, " V"], is_valid: Bool[Array, " V"]) -> Bool[Array, "L V"]:

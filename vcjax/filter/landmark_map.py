@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.features import match
 from vcjax.filter.state import FREE, SLOT, FilterState
 from vcjax.models.camera import is_inside
 from vcjax.models.landmarks import INVERSE_DEPTH, back_project_landmark
@@ -19,6 +20,22 @@ def delete(state: FilterState, is_deleted: Bool[Array, " L"]) -> FilterState:
     """
     track_id = jnp.where(is_deleted, FREE, state.track_id)
     return eqx.tree_at(lambda s: s.track_id, state, track_id)
+
+
+def retire(config: FilterConfig, state: FilterState, is_near: Bool[Array, " L"]) -> FilterState:
+    """Free the slots of landmarks whose features are never measured again, and which nothing depends on any more.
+
+    Among the predicted, a landmark that is not measured can be chosen for update as long as it is predicted visible
+    (see `FilterConfig.retire`), so it stays while it is near the image.
+    """
+    is_retired = state.has_ended & ~is_near if config.choose_among == "predicted" else state.has_ended
+    return delete(state, is_retired)
+
+
+def note_ended(state: FilterState, frame: Frame) -> FilterState:
+    """Note which landmarks' features are measured for the last time in this frame."""
+    is_last = jnp.any(match(state, frame.track_id, frame.is_valid & frame.is_last), axis=1)
+    return eqx.tree_at(lambda s: s.has_ended, state, state.has_ended | is_last)
 
 
 def ban(state: FilterState, is_banned: Bool[Array, " L"]) -> FilterState:
@@ -99,7 +116,7 @@ def _initialise(
     P_mm = jax.lax.dynamic_update_slice_in_dim(state.P_mm, rows, first, axis=0)
     P_mm = jax.lax.dynamic_update_slice_in_dim(P_mm, rows.T, first, axis=1)
     return eqx.tree_at(
-        lambda s: (s.landmarks, s.to_coordinates, s.P_vm, s.P_mm, s.track_id, s.is_euclidean, s.detector),
+        lambda s: (s.landmarks, s.to_coordinates, s.P_vm, s.P_mm, s.track_id, s.is_euclidean, s.has_ended, s.detector),
         state,
         (
             state.landmarks.at[slot].set(landmark),
@@ -108,6 +125,7 @@ def _initialise(
             P_mm,
             state.track_id.at[slot].set(born_id.astype(state.track_id.dtype)),
             state.is_euclidean.at[slot].set(False),
+            state.has_ended.at[slot].set(False),
             jax.tree.map(lambda field, value: field.at[slot].set(value), state.detector, config.detector.born()),
         ),
     )

@@ -2,7 +2,7 @@
 
 One frame, in order: prediction (6) (7); every landmark's pixel predicted; the K most uncertain visible ones chosen;
 formal corrections (8)–(12), the gate's verdict (13) (14), corrections with the recovered; deletion of what gate or
-detector flagged; retirement of what will not be seen again; births.
+detector flagged; retirement of what cannot matter any more; births.
 """
 
 import equinox as eqx
@@ -55,7 +55,7 @@ class FrameInfo(eqx.Module):
     born_id: Int[Array, " births"]
     """Features initialised; -1 for an attempt without a birth."""
     track_id: Int[Array, " L"]
-    """Feature held by each slot at the end of the frame, before retirement; -1 where free."""
+    """Feature held by each slot at the end of the frame; -1 where free."""
     map_is_full: Bool[Array, ""]
     """Whether a feature waits for a free slot."""
     is_finite: Bool[Array, ""]
@@ -136,6 +136,8 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     )
     is_deleted = is_dynamic | is_flagged
     state = landmark_map.delete(landmark_map.ban(state, is_deleted), is_deleted)
+    if config.retire:
+        state = landmark_map.retire(config, state, prediction.is_near)
     is_mapped = jnp.any(matches & state.is_mapped[:, None], axis=0)
     return _finish(config, state, frame, is_mapped, config.births_per_frame, info_of_candidates)
 
@@ -188,19 +190,16 @@ def _finish(
     num_births: int,
     info_of_candidates: dict[str, Array],
 ) -> tuple[FilterState, FrameInfo]:
-    """Births and retirement, and the frame's info."""
+    """Births, and the frame's info."""
     state, born, is_full = landmark_map.give_birth(config, state, frame, is_mapped, num_births)
+    state = landmark_map.note_ended(state, frame)
     attempts = max(config.births_first_frame, config.births_per_frame)
-    track_id = state.track_id
-    if config.retire:
-        is_last = match(state, frame.track_id, frame.is_valid & frame.is_last)
-        state = landmark_map.delete(state, jnp.any(is_last, axis=1))
     vehicle_cov = state.P_vv
     info = FrameInfo(
         vehicle=state.vehicle,
         vehicle_cov=vehicle_cov,
         born_id=jnp.full(attempts, FREE, born.dtype).at[:num_births].set(born),
-        track_id=track_id,
+        track_id=state.track_id,
         map_is_full=is_full,
         is_finite=jnp.all(jnp.isfinite(state.vehicle)) & jnp.all(jnp.isfinite(vehicle_cov)),
         **info_of_candidates,

@@ -53,6 +53,8 @@ class FilterState(eqx.Module):
     """Which feature a slot holds; -1 where it is free."""
     is_euclidean: Bool[Array, " L"]
     """Whether a landmark has become Euclidean."""
+    has_ended: Bool[Array, " L"]
+    """Whether a landmark's feature is never measured again in the recording."""
     detector: PyTree
     """The detector's state of every slot."""
     blacklist: Int[Array, " B"]
@@ -106,6 +108,7 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
         P_mm=jnp.zeros((size, size), dtype),
         track_id=jnp.full(num_slots, FREE, jnp.int32),
         is_euclidean=jnp.zeros(num_slots, bool),
+        has_ended=jnp.zeros(num_slots, bool),
         detector=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_slots, *leaf.shape)), config.detector.born()),
         blacklist=jnp.full(config.blacklist_capacity, FREE, jnp.int32),
         key=key,
