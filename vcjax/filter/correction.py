@@ -11,8 +11,9 @@ from vcjax.ekf import mahalanobis, whiten, whitener
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.features import measurement_model, observe
 from vcjax.filter.reparametrisation import AtCorrection
-from vcjax.filter.state import SLOT, VEHICLE
-from vcjax.filter.submap import Submap, block, block_columns, block_cov, landmark_means, slot_rows, vehicle_mean
+from vcjax.filter.map_covariance import SLOT
+from vcjax.filter.state import VEHICLE
+from vcjax.filter.submap import Submap, block, block_columns, block_cov, first_row, landmark_means, vehicle_mean
 from vcjax.gates.gate import Candidates, Verdict
 from vcjax.models.camera import Camera
 from vcjax.models.landmarks import INVERSE_DEPTH
@@ -72,17 +73,27 @@ def correct_frame(
             config, camera, submap, uv_px, is_measured, is_gated=True
         )
 
-    prior = predicted if gate.prior == "predicted" else submap
-    everyone = jnp.arange(num_candidates)
-    candidates = Candidates(
-        mean=jax.vmap(block, in_axes=(None, 0))(prior, everyone),
-        P=jax.vmap(block_cov, in_axes=(None, 0))(prior, everyone),
-        uv_px=uv_px,
-        R=_pixel_cov(config, uv_px.dtype),
-        is_isolated=is_measured & ~is_accepted,
-    )
-    verdict = gate.judge(candidates, measurement_model(config, camera))
-    submap = _correct_recovered(config, camera, submap, uv_px, verdict.is_recovered)
+    is_isolated = is_measured & ~is_accepted
+
+    def judge(submap: Submap) -> tuple[Submap, Verdict]:
+        prior = predicted if gate.prior == "predicted" else submap
+        everyone = jnp.arange(num_candidates)
+        candidates = Candidates(
+            mean=jax.vmap(block, in_axes=(None, 0))(prior, everyone),
+            P=jax.vmap(block_cov, in_axes=(None, 0))(prior, everyone),
+            uv_px=uv_px,
+            R=_pixel_cov(config, uv_px.dtype),
+            is_isolated=is_isolated,
+        )
+        verdict = gate.judge(candidates, measurement_model(config, camera))
+        return _correct_recovered(config, camera, submap, uv_px, verdict.is_recovered), verdict
+
+    def judge_nobody(submap: Submap) -> tuple[Submap, Verdict]:
+        nobody, nothing = jnp.zeros_like(is_isolated), jnp.full(num_candidates, jnp.nan, uv_px.dtype)
+        return submap, Verdict(nobody, nobody, nothing, nothing)
+
+    # In most frames nobody is isolated.
+    submap, verdict = jax.lax.cond(jnp.any(is_isolated), judge, judge_nobody, submap)
     submap = eqx.tree_at(lambda s: s.is_corrected, submap, is_accepted | verdict.is_recovered)
     return submap, Outcome(innovation, is_accepted, verdict)
 
@@ -106,7 +117,7 @@ def innovate(
     # P is symmetric, so its columns may be read with those of U: one product gives P Hᵀ and U Hᵀ.
     both = block_columns(jnp.concatenate([submap.P, submap.U]), j) @ H.T
     PH, UH = both[: submap.P.shape[0]], both[submap.P.shape[0] :]
-    own = jnp.concatenate([PH[:VEHICLE], jax.lax.dynamic_slice_in_dim(PH, slot_rows(j), SLOT)])
+    own = jnp.concatenate([PH[:VEHICLE], jax.lax.dynamic_slice_in_dim(PH, first_row(j), SLOT)])
     S = H @ own + _pixel_cov(config, H.dtype)
     z = uv_px - observation.pixel
     return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible), Gain(H, PH, UH)
@@ -159,10 +170,9 @@ def _apply(
 ) -> Submap:
     """One correction, u = W H P: P - uᵀu and x + uᵀ(W z); nothing at all where it is not used. Equations (10)–(12)."""
     W = whitener(innovation.S)
-    wide = jnp.zeros_like(gain.PH.T).at[:, :VEHICLE].set(gain.H[:, :VEHICLE])
-    wide = jax.lax.dynamic_update_slice_in_dim(wide, gain.H[:, VEHICLE:], slot_rows(j), axis=1)
+    own = jnp.arange(len(submap.T)) == 2 * j + jnp.arange(2)[:, None]
     u = jnp.where(is_used, whiten(W, gain.PH.T), 0.0)
-    c = jnp.where(is_used, whiten(W, wide - gain.UH.T @ submap.C), 0.0)
+    t = jnp.where(is_used, whiten(W, own - gain.UH.T @ submap.T), 0.0)
     w = jnp.where(is_used, whiten(W, innovation.z), 0.0)
 
     def write(rows, new, index):
@@ -172,17 +182,18 @@ def _apply(
 
     vehicle_before = vehicle_mean(submap)
     moved = eqx.tree_at(
-        lambda s: (s.shift, s.P, s.U, s.C, s.w),
+        lambda s: (s.shift, s.P, s.U, s.H, s.T, s.w),
         submap,
         (
             submap.shift + u.T @ w,
             submap.P - u.T @ u,
             write(submap.U, u, 2 * j),
-            write(submap.C, c, 2 * j),
+            write(submap.H, gain.H[None], j),
+            write(submap.T, t, 2 * j),
             write(submap.w, w, 2 * j),
         ),
     )
-    last = slot_rows(j) + INVERSE_DEPTH
+    last = first_row(j) + INVERSE_DEPTH
     noted = AtCorrection(block(moved, j).landmark, moved.P[last, last], vehicle_before)
     at_correction = jax.tree.map(lambda rows, new: write(rows, new[None], j), submap.at_correction, noted)
     return eqx.tree_at(lambda s: s.at_correction, moved, at_correction)
@@ -194,25 +205,25 @@ def _correct_stacked(
     """Correct with all candidates at once, all linearised at the predicted state: Z = H P Hᵀ + R is 2K × 2K."""
     num_candidates, size = is_used.shape[0], submap.P.shape[0]
 
-    def wide(j, y, used):
+    def measure(j, y, used):
         observation = observe(config, camera, block(submap, j))
-        H = jnp.zeros((2, size), submap.P.dtype).at[:, :VEHICLE].set(observation.H[:, :VEHICLE])
-        H = jax.lax.dynamic_update_slice_in_dim(H, observation.H[:, VEHICLE:], slot_rows(j), axis=1)
-        return jnp.where(used, H, 0.0), jnp.where(used, y - observation.pixel, 0.0)
+        wide = jnp.zeros((2, size), submap.P.dtype).at[:, :VEHICLE].set(observation.H[:, :VEHICLE])
+        wide = jax.lax.dynamic_update_slice_in_dim(wide, observation.H[:, VEHICLE:], first_row(j), axis=1)
+        return tuple(jnp.where(used, number, 0.0) for number in (observation.H, wide, y - observation.pixel))
 
     # A candidate that is not used measures nothing: H = 0, z = 0, and its block of Z is R.
-    H, z = jax.vmap(wide)(jnp.arange(num_candidates), uv_px, is_used)
-    H, z = H.reshape(-1, size), z.reshape(-1)
-    HP = H @ submap.P
+    H, wide, z = jax.vmap(measure)(jnp.arange(num_candidates), uv_px, is_used)
+    wide, z = wide.reshape(-1, size), z.reshape(-1)
+    HP = wide @ submap.P
     R = jnp.kron(jnp.eye(num_candidates, dtype=HP.dtype), _pixel_cov(config, HP.dtype))
-    L = jnp.linalg.cholesky(HP @ H.T + R)
-    U, C = (jax.scipy.linalg.solve_triangular(L, rows, lower=True) for rows in (HP, H))
-    w = jax.scipy.linalg.solve_triangular(L, z, lower=True)
+    L = jnp.linalg.cholesky(HP @ wide.T + R)
+    T = jax.scipy.linalg.solve_triangular(L, jnp.eye(len(L), dtype=L.dtype), lower=True)
+    U, w = T @ HP, T @ z
     vehicle_before = jnp.broadcast_to(vehicle_mean(submap), (num_candidates, VEHICLE))
     moved = eqx.tree_at(
-        lambda s: (s.shift, s.P, s.U, s.C, s.w), submap, (submap.shift + U.T @ w, submap.P - U.T @ U, U, C, w)
+        lambda s: (s.shift, s.P, s.U, s.H, s.T, s.w), submap, (submap.shift + U.T @ w, submap.P - U.T @ U, U, H, T, w)
     )
-    last = slot_rows(jnp.arange(num_candidates)) + INVERSE_DEPTH
+    last = first_row(jnp.arange(num_candidates)) + INVERSE_DEPTH
     at_correction = AtCorrection(landmark_means(moved), moved.P[last, last], vehicle_before)
     return eqx.tree_at(lambda s: s.at_correction, moved, at_correction)
 

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.features import match
-from vcjax.filter.state import FREE, SLOT, FilterState
+from vcjax.filter.map_covariance import SLOT
+from vcjax.filter.state import FREE, FilterState
 from vcjax.models.camera import is_inside
 from vcjax.models.landmarks import INVERSE_DEPTH, back_project_landmark
 from vcjax.recording import Frame
@@ -30,12 +30,6 @@ def retire(config: FilterConfig, state: FilterState, is_near: Bool[Array, " L"])
     """
     is_retired = state.has_ended & ~is_near if config.choose_among == "predicted" else state.has_ended
     return delete(state, is_retired)
-
-
-def note_ended(state: FilterState, frame: Frame) -> FilterState:
-    """Note which landmarks' features are measured for the last time in this frame."""
-    is_last = jnp.any(match(state, frame.track_id, frame.is_valid & frame.is_last), axis=1)
-    return eqx.tree_at(lambda s: s.has_ended, state, state.has_ended | is_last)
 
 
 def ban(state: FilterState, is_banned: Bool[Array, " L"]) -> FilterState:
@@ -125,7 +119,7 @@ def _initialise(
             P_mm,
             state.track_id.at[slot].set(born_id.astype(state.track_id.dtype)),
             state.is_euclidean.at[slot].set(False),
-            state.has_ended.at[slot].set(False),
+            state.has_ended.at[slot].set(frame.is_last[column]),
             jax.tree.map(lambda field, value: field.at[slot].set(value), state.detector, config.detector.born()),
         ),
     )

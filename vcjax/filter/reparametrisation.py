@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.state import SLOT
+from vcjax.filter.map_covariance import SLOT
 from vcjax.models.frames import unit
 from vcjax.models.landmarks import INVERSE_DEPTH, Landmark, euclidean, linearity_index, to_point, to_point_jacobian
 

@@ -94,10 +94,10 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     """
     state = predict(config, state, frame)
     prediction = predict_features(config, state, frame.camera)
-    matches = match(state, frame.track_id, frame.is_valid)
-    slot, is_searched = choose(config, prediction, jnp.any(matches, axis=1))
-    is_measured = is_searched & jnp.any(matches[slot], axis=1)
-    uv_px = frame.uv_px[jnp.argmax(matches[slot], axis=1)]
+    column = match(state, frame)
+    slot, is_searched = choose(config, prediction, column >= 0)
+    is_measured = is_searched & (column[slot] >= 0)
+    uv_px = frame.uv_px[column[slot]]
 
     submap, rows = gather(state, slot)
     submap, outcome = correct_frame(config, frame.camera, submap, uv_px, is_measured)
@@ -118,7 +118,8 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     )
     detector, is_flagged = config.detector.observe(state.detector, evidence)
     is_flagged &= state.is_mapped & ~is_dynamic
-    state = eqx.tree_at(lambda s: s.detector, state, detector)
+    has_ended = state.has_ended | (frame.is_last[column] & (column >= 0))
+    state = eqx.tree_at(lambda s: (s.detector, s.has_ended), state, (detector, has_ended))
 
     info_of_candidates = dict(
         candidate_id=jnp.where(is_searched, state.track_id[slot], FREE),
@@ -138,7 +139,9 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     state = landmark_map.delete(landmark_map.ban(state, is_deleted), is_deleted)
     if config.retire:
         state = landmark_map.retire(config, state, prediction.is_near)
-    is_mapped = jnp.any(matches & state.is_mapped[:, None], axis=0)
+    num_features = frame.is_valid.shape[0]
+    place = jnp.where(state.is_mapped & (column >= 0), column, num_features)
+    is_mapped = jnp.zeros(num_features, bool).at[place].set(True, mode="drop")
     return _finish(config, state, frame, is_mapped, config.births_per_frame, info_of_candidates)
 
 
@@ -192,7 +195,6 @@ def _finish(
 ) -> tuple[FilterState, FrameInfo]:
     """Births, and the frame's info."""
     state, born, is_full = landmark_map.give_birth(config, state, frame, is_mapped, num_births)
-    state = landmark_map.note_ended(state, frame)
     attempts = max(config.births_first_frame, config.births_per_frame)
     vehicle_cov = state.P_vv
     info = FrameInfo(

@@ -21,15 +21,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.map_covariance import SLOT, SLOTS_PER_BLOCK, slot_blocks, symmetric
 from vcjax.models.frames import unit
 from vcjax.recording import Recording
 
 VEHICLE = 14
 """Error coordinates of robot and sensor."""
-SLOT = 7
-"""Error coordinates of a landmark slot."""
-SLOTS_PER_BLOCK = 16
-"""Slots that P_mm's passes take at a time."""
 FREE = -1
 """Track id of a free slot."""
 
@@ -48,7 +45,7 @@ class FilterState(eqx.Module):
     P_vm: Float[Array, "14 M"]
     """Covariance of vehicle with slots' error coordinates, M = 7 L; [P_rm; P_sm]."""
     P_mm: Float[Array, "M M"]
-    """Covariance of slots' error coordinates."""
+    """Covariance of slots' error coordinates, current on and below the diagonal tiles (see `map_covariance`)."""
     track_id: Int[Array, " L"]
     """Which feature a slot holds; -1 where it is free."""
     is_euclidean: Bool[Array, " L"]
@@ -115,17 +112,10 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
     )
 
 
-def slot_blocks(state: FilterState) -> Float[Array, "L 7 7"]:
-    """Covariance of each slot's own error coordinates, the diagonal blocks of P_mm."""
-    num_slots = state.track_id.shape[0]
-    blocks = state.P_mm.reshape(num_slots, SLOT, num_slots, SLOT)
-    return blocks[jnp.arange(num_slots), :, jnp.arange(num_slots), :]
-
-
 def landmark_cov(state: FilterState) -> Float[Array, "L 7 7"]:
     """Covariance of each landmark's coordinates (the last four rows and columns are zero where Euclidean)."""
     T = state.to_coordinates
-    return T @ slot_blocks(state) @ T.mT
+    return T @ slot_blocks(state.P_mm) @ T.mT
 
 
 def full_cov(state: FilterState) -> Float[Array, "N N"]:
@@ -133,6 +123,7 @@ def full_cov(state: FilterState) -> Float[Array, "N N"]:
     num_slots = state.track_id.shape[0]
     T = jnp.where(state.is_mapped[:, None, None], state.to_coordinates, 0.0)
     P_vm = jnp.einsum("vlj,lij->vli", state.P_vm.reshape(VEHICLE, num_slots, SLOT), T).reshape(VEHICLE, -1)
-    P_mm = jnp.einsum("lij,ljmk,mnk->limn", T, state.P_mm.reshape(num_slots, SLOT, num_slots, SLOT), T)
+    P_mm = symmetric(state.P_mm).reshape(num_slots, SLOT, num_slots, SLOT)
+    P_mm = jnp.einsum("lij,ljmk,mnk->limn", T, P_mm, T)
     size = num_slots * SLOT
     return jnp.block([[state.P_vv, P_vm], [P_vm.T, P_mm.reshape(size, size)]])

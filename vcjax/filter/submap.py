@@ -6,10 +6,10 @@ cache. The rest of the state follows in one pass. With S = L Lᵀ the innovation
 
     u_j = W H_j P,    P ← P - u_jᵀ u_j,    x ← x + u_jᵀ (W z_j),
 
-and every u_j is a fixed combination of rows of the P the frame began with, u_j = c_j P⁰[submap, :], where
-c_j = W (H_j - (H_j u_<jᵀ) c_<j) stays within the submap. So at the end of the frame
+and every u_j is a fixed combination of rows of H P⁰, P⁰ the covariance the frame began with: u_j = t_j H P⁰, where
+t_j = W (e_j - (H_j u_<jᵀ) t_<j) has only 2 K numbers. So at the end of the frame
 
-    U = C P⁰[submap, :],    P ← P⁰ - Uᵀ U,    x ← x + Uᵀ w:
+    U = T H P⁰,    P ← P⁰ - Uᵀ U,    x ← x + Uᵀ w:
 
 the covariance downdate is delayed, gathered in one symmetric rank-2K product, and equals the textbook's sequential full
 updates to rounding error.
@@ -22,8 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.features import Block
+from vcjax.filter.map_covariance import SLOT, downdate, slot_rows
 from vcjax.filter.reparametrisation import AtCorrection, Slots, settle
-from vcjax.filter.state import SLOT, SLOTS_PER_BLOCK, VEHICLE, FilterState
+from vcjax.filter.state import VEHICLE, FilterState
 from vcjax.models.frames import unit, unit_jacobian
 
 
@@ -42,8 +43,10 @@ class Submap(eqx.Module):
     """Covariance, current."""
     U: Float[Array, "M n"]
     """Rows u_j of the corrections so far, two for each; M = 2 K."""
-    C: Float[Array, "M n"]
-    """The same rows as combinations of the rows of P⁰."""
+    H: Float[Array, "K 2 21"]
+    """Their measurement derivatives."""
+    T: Float[Array, "M M"]
+    """The same rows as combinations of the rows of H P⁰."""
     w: Float[Array, " M"]
     """White innovations W z."""
     at_correction: AtCorrection
@@ -52,7 +55,7 @@ class Submap(eqx.Module):
     """Which were corrected with."""
 
 
-def slot_rows(j: int | Int[Array, "*j"]) -> int | Int[Array, "*j"]:
+def first_row(j: int | Int[Array, "*j"]) -> int | Int[Array, "*j"]:
     """First row of candidate j in the submap."""
     return VEHICLE + SLOT * j
 
@@ -71,30 +74,29 @@ def landmark_means(submap: Submap) -> Float[Array, "K 7"]:
 def block(submap: Submap, j: int | Int[Array, ""]) -> Block:
     """Current mean of the block of candidate j."""
     T = submap.to_coordinates[j]
-    slot = jax.lax.dynamic_slice_in_dim(submap.shift, slot_rows(j), SLOT)
+    slot = jax.lax.dynamic_slice_in_dim(submap.shift, first_row(j), SLOT)
     return Block(vehicle_mean(submap), submap.landmarks[j] + jnp.sum(T * slot, axis=-1), T)
 
 
 def block_cov(submap: Submap, j: int | Int[Array, ""]) -> Float[Array, "21 21"]:
     """Covariance of the block of candidate j: vehicle and its slot."""
     columns = block_columns(submap.P, j)
-    return jnp.concatenate([columns[:VEHICLE], jax.lax.dynamic_slice_in_dim(columns, slot_rows(j), SLOT)])
+    return jnp.concatenate([columns[:VEHICLE], jax.lax.dynamic_slice_in_dim(columns, first_row(j), SLOT)])
 
 
 def block_columns(matrix: Float[Array, "rows n"], j: int | Int[Array, ""]) -> Float[Array, "rows 21"]:
     """The columns of vehicle and slot of candidate j."""
-    own = jax.lax.dynamic_slice_in_dim(matrix, slot_rows(j), SLOT, axis=-1)
+    own = jax.lax.dynamic_slice_in_dim(matrix, first_row(j), SLOT, axis=-1)
     return jnp.concatenate([matrix[..., :VEHICLE], own], axis=-1)
 
 
-def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Array, "n M"]]:
-    """The submap of the chosen slots, and its covariance with all slots, P⁰[submap, slots]."""
+def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Array, "K 7 M"]]:
+    """The submap of the chosen slots, and their covariance with all slots."""
     num_slots, num_chosen = state.track_id.shape[0], slot.shape[0]
-    chosen = state.P_mm.reshape(num_slots, SLOT, -1)[slot].reshape(num_chosen * SLOT, -1)
-    rows = jnp.concatenate([state.P_vm, chosen])
-    columns = rows.reshape(-1, num_slots, SLOT)[:, slot].reshape(-1, num_chosen * SLOT)
-    P = jnp.concatenate([jnp.concatenate([state.P_vv, columns[:VEHICLE].T]), columns], axis=1)
-    empty = jnp.zeros((2 * num_chosen, P.shape[0]), P.dtype)
+    rows = slot_rows(state.P_mm, slot)
+    P_vc = state.P_vm.reshape(VEHICLE, num_slots, SLOT)[:, slot].reshape(VEHICLE, -1)
+    P_cc = rows.reshape(num_chosen * SLOT, num_slots, SLOT)[:, slot].reshape(num_chosen * SLOT, -1)
+    P = jnp.block([[state.P_vv, P_vc], [P_vc.T, P_cc]])
     submap = Submap(
         vehicle=state.vehicle,
         landmarks=state.landmarks[slot],
@@ -102,8 +104,9 @@ def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Ar
         is_euclidean=state.is_euclidean[slot],
         shift=jnp.zeros(P.shape[0], P.dtype),
         P=P,
-        U=empty,
-        C=empty,
+        U=jnp.zeros((2 * num_chosen, P.shape[0]), P.dtype),
+        H=jnp.zeros((num_chosen, 2, VEHICLE + SLOT), P.dtype),
+        T=jnp.zeros((2 * num_chosen, 2 * num_chosen), P.dtype),
         w=jnp.zeros(2 * num_chosen, P.dtype),
         at_correction=AtCorrection(
             jnp.zeros((num_chosen, SLOT), P.dtype),
@@ -116,14 +119,16 @@ def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Ar
 
 
 def scatter(
-    config: FilterConfig, state: FilterState, submap: Submap, slot: Int[Array, " K"], rows: Float[Array, "n M"]
+    config: FilterConfig, state: FilterState, submap: Submap, slot: Int[Array, " K"], rows: Float[Array, "K 7 M"]
 ) -> FilterState:
     """The state after the frame's corrections, from the submap and the rows it was gathered with.
 
-    The rest of the state follows by U = C P⁰[submap, :]. Landmarks settle (see `reparametrisation`). Then both
-    quaternions are brought to unit length, q/|q|, and P ← N P Nᵀ with N the derivative of that.
+    The rest of the state follows by U = T H P⁰. Landmarks settle (see `reparametrisation`). Then both quaternions are
+    brought to unit length, q/|q|, and P ← N P Nᵀ with N the derivative of that.
     """
-    U = submap.C @ rows
+    H_v, H_l = submap.H[..., :VEHICLE], submap.H[..., VEHICLE:]
+    HP = H_v.reshape(-1, VEHICLE) @ state.P_vm + jnp.einsum("kai,kim->kam", H_l, rows).reshape(len(submap.T), -1)
+    U = submap.T @ HP
     shift = (U.T @ submap.w).reshape(-1, SLOT)
     landmarks = state.landmarks + jnp.sum(state.to_coordinates * shift[:, None], axis=-1)
     slots = Slots(landmark_means(submap), submap.to_coordinates, submap.is_euclidean)
@@ -138,27 +143,18 @@ def scatter(
             state.to_coordinates.at[slot].set(slots.to_coordinates),
             state.is_euclidean.at[slot].set(slots.is_euclidean),
             N @ submap.P[:VEHICLE, :VEHICLE] @ N.T,
-            N @ (state.P_vm - submap.U[:, :VEHICLE].T @ U),
-            downdate(config, state, U),
+            N @ state.P_vm - (N @ submap.U[:, :VEHICLE].T) @ U,
+            _downdate(config, state, U),
         ),
     )
 
 
-def downdate(config: FilterConfig, state: FilterState, U: Float[Array, "K2 M"]) -> Float[Array, "M M"]:
-    """P_mm - Uᵀ U, all of it or the blocks of rows up to the last slot in use; free slots' rows mean nothing."""
+def _downdate(config: FilterConfig, state: FilterState, U: Float[Array, "K2 M"]) -> Float[Array, "M M"]:
+    """P_mm - Uᵀ U, all of it or the part in use; free slots' rows mean nothing."""
     if config.reverse_mode or not config.skip_free_slots:
         return state.P_mm - U.T @ U
-    num_slots = state.track_id.shape[0]
-    num_used = jnp.max(jnp.where(state.is_mapped, jnp.arange(1, num_slots + 1), 0))
-    size = SLOTS_PER_BLOCK * SLOT
-
-    def downdate_block(i, P_mm):
-        rows = jax.lax.dynamic_slice_in_dim(P_mm, size * i, size)
-        rows -= jax.lax.dynamic_slice_in_dim(U, size * i, size, axis=1).T @ U
-        return jax.lax.dynamic_update_slice_in_dim(P_mm, rows, size * i, axis=0)
-
-    num_blocks = (num_used + SLOTS_PER_BLOCK - 1) // SLOTS_PER_BLOCK
-    return jax.lax.fori_loop(0, num_blocks, downdate_block, state.P_mm)
+    num_used = jnp.max(jnp.where(state.is_mapped, jnp.arange(1, len(state.is_mapped) + 1), 0))
+    return downdate(state.P_mm, U, num_used)
 
 
 def normalise(config: FilterConfig, vehicle: Float[Array, "14"]) -> tuple[Float[Array, "14"], Float[Array, "14 14"]]:

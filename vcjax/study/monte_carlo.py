@@ -132,7 +132,11 @@ def run_lanes(
     return {name: np.concatenate([part[name] for part in done]) for name in done[0]}
 
 
-@partial(jax.jit, static_argnames=("mesh", "batch_size"))
+# On a CPU lanes are what runs in parallel: sharing each small product between threads as well only costs.
+_ONE_THREAD_PER_LANE = {"xla_cpu_multi_thread_eigen": False}
+
+
+@partial(jax.jit, static_argnames=("mesh", "batch_size"), compiler_options=_ONE_THREAD_PER_LANE)
 def _run_lanes(experiment, swept, seeds, key, mesh: Mesh, batch_size: int) -> dict[str, Array]:
     def run_lane(lane):
         swept, seed = lane
