@@ -13,6 +13,7 @@ from filter_runs import CAPACITY, filtered, head, quick_jit, recorded
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import Block, observe, predict_features
+from vcjax.filter.map_covariance import symmetric
 from vcjax.filter.state import SLOT, VEHICLE
 from vcjax.filter.submap import gather, scatter
 from vcjax.gates.reprojection import ReprojectionError
@@ -64,7 +65,7 @@ def problem():
 
 def dense_cov(state):
     """P of vehicle and all slots' error coordinates."""
-    return np.block([[state.P_vv, state.P_vm], [state.P_vm.T, state.P_mm]])
+    return np.block([[state.P_vv, state.P_vm], [state.P_vm.T, symmetric(state.P_mm)]])
 
 
 def with_cov(state, P):

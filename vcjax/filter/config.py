@@ -23,7 +23,7 @@ class FilterConfig(eqx.Module):
     detector: AbstractDetector = eqx.field(default_factory=InlierRatio)
     """Which landmarks are deleted over time."""
 
-    max_landmarks: int = eqx.field(static=True, default=111)
+    max_landmarks: int = eqx.field(static=True, default=107)
     """Landmark slots. A full map is reported, and no feature is born until a slot is free."""
     max_updates: int = eqx.field(static=True, default=10)
     """Landmarks corrected per frame (Table 1: 10)."""

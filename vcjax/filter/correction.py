@@ -11,9 +11,17 @@ from vcjax.ekf import mahalanobis, whiten, whitener
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.features import measurement_model, observe
 from vcjax.filter.reparametrisation import AtCorrection
-from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.state import VEHICLE
-from vcjax.filter.submap import Submap, block, block_columns, block_cov, first_row, landmark_means, vehicle_mean
+from vcjax.filter.submap import (
+    Submap,
+    block,
+    block_columns,
+    block_cov,
+    block_rows,
+    first_row,
+    landmark_means,
+    vehicle_mean,
+)
 from vcjax.gates.gate import Candidates, Verdict
 from vcjax.models.camera import Camera
 from vcjax.models.landmarks import INVERSE_DEPTH
@@ -102,10 +110,10 @@ class Gain(NamedTuple):
     """What a correction needs beside its innovation."""
 
     H: Float[Array, "2 21"]
-    PH: Float[Array, "n 2"]
-    """P Hᵀ."""
-    UH: Float[Array, "M 2"]
-    """U Hᵀ, of the rows of the corrections so far."""
+    HP: Float[Array, "2 n"]
+    """H P."""
+    HU: Float[Array, "2 M"]
+    """H Uᵀ, of the rows of the corrections so far."""
 
 
 def innovate(
@@ -114,13 +122,11 @@ def innovate(
     """Innovation of candidate j at the submap's present state. Equations (8), (9), (13)."""
     observation = observe(config, camera, block(submap, j))
     H = observation.H
-    # P is symmetric, so its columns may be read with those of U: one product gives P Hᵀ and U Hᵀ.
-    both = block_columns(jnp.concatenate([submap.P, submap.U]), j) @ H.T
-    PH, UH = both[: submap.P.shape[0]], both[submap.P.shape[0] :]
-    own = jnp.concatenate([PH[:VEHICLE], jax.lax.dynamic_slice_in_dim(PH, first_row(j), SLOT)])
-    S = H @ own + _pixel_cov(config, H.dtype)
+    HU = H @ block_columns(submap.U, j).T
+    HP = H @ block_rows(submap.P, j) - HU @ submap.U
+    S = block_columns(HP, j) @ H.T + _pixel_cov(config, H.dtype)
     z = uv_px - observation.pixel
-    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible), Gain(H, PH, UH)
+    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible), Gain(H, HP, HU)
 
 
 def _correct_sequentially(
@@ -171,8 +177,8 @@ def _apply(
     """One correction, u = W H P: P - uᵀu and x + uᵀ(W z); nothing at all where it is not used. Equations (10)–(12)."""
     W = whitener(innovation.S)
     own = jnp.arange(len(submap.T)) == 2 * j + jnp.arange(2)[:, None]
-    u = jnp.where(is_used, whiten(W, gain.PH.T), 0.0)
-    t = jnp.where(is_used, whiten(W, own - gain.UH.T @ submap.T), 0.0)
+    u = jnp.where(is_used, whiten(W, gain.HP), 0.0)
+    t = jnp.where(is_used, whiten(W, own - gain.HU @ submap.T), 0.0)
     w = jnp.where(is_used, whiten(W, innovation.z), 0.0)
 
     def write(rows, new, index):
@@ -182,19 +188,18 @@ def _apply(
 
     vehicle_before = vehicle_mean(submap)
     moved = eqx.tree_at(
-        lambda s: (s.shift, s.P, s.U, s.H, s.T, s.w),
+        lambda s: (s.shift, s.U, s.H, s.T, s.w),
         submap,
         (
             submap.shift + u.T @ w,
-            submap.P - u.T @ u,
             write(submap.U, u, 2 * j),
             write(submap.H, gain.H[None], j),
             write(submap.T, t, 2 * j),
             write(submap.w, w, 2 * j),
         ),
     )
-    last = first_row(j) + INVERSE_DEPTH
-    noted = AtCorrection(block(moved, j).landmark, moved.P[last, last], vehicle_before)
+    variance = _inverse_depth_variance(moved, j)
+    noted = AtCorrection(block(moved, j).landmark, variance, vehicle_before)
     at_correction = jax.tree.map(lambda rows, new: write(rows, new[None], j), submap.at_correction, noted)
     return eqx.tree_at(lambda s: s.at_correction, moved, at_correction)
 
@@ -220,12 +225,16 @@ def _correct_stacked(
     T = jax.scipy.linalg.solve_triangular(L, jnp.eye(len(L), dtype=L.dtype), lower=True)
     U, w = T @ HP, T @ z
     vehicle_before = jnp.broadcast_to(vehicle_mean(submap), (num_candidates, VEHICLE))
-    moved = eqx.tree_at(
-        lambda s: (s.shift, s.P, s.U, s.H, s.T, s.w), submap, (submap.shift + U.T @ w, submap.P - U.T @ U, U, H, T, w)
-    )
-    last = first_row(jnp.arange(num_candidates)) + INVERSE_DEPTH
-    at_correction = AtCorrection(landmark_means(moved), moved.P[last, last], vehicle_before)
+    moved = eqx.tree_at(lambda s: (s.shift, s.U, s.H, s.T, s.w), submap, (submap.shift + U.T @ w, U, H, T, w))
+    variance = _inverse_depth_variance(moved, jnp.arange(num_candidates))
+    at_correction = AtCorrection(landmark_means(moved), variance, vehicle_before)
     return eqx.tree_at(lambda s: s.at_correction, moved, at_correction)
+
+
+def _inverse_depth_variance(submap: Submap, j: int | Int[Array, "*j"]) -> Float[Array, "*j"]:
+    """Current variance of the last error coordinate of candidate j."""
+    last = first_row(j) + INVERSE_DEPTH
+    return submap.P[last, last] - jnp.sum(submap.U[:, last] ** 2, axis=0)
 
 
 def _pixel_cov(config: FilterConfig, dtype) -> Float[Array, "2 2"]:

@@ -118,8 +118,11 @@ def _uncertainty(H: Float[Array, "L 2 21"], state: FilterState) -> Float[Array, 
     H_v, H_l = H[..., :VEHICLE], H[..., VEHICLE:]
     P_vl, P_ll = state.P_vm.reshape(VEHICLE, num_slots, SLOT), 0.5 * slot_blocks(state.P_mm)
     HP_vv = (H_v.reshape(-1, VEHICLE) @ state.P_vv).reshape(H_v.shape)
-    X = sum(H_v[:, :, v, None] * P_vl[v, :, None] for v in range(VEHICLE))
-    X += sum(H_l[:, :, i, None] * P_ll[:, None, i] for i in range(SLOT))
+    X = jnp.zeros((num_slots, 2, SLOT), H.dtype)
+    for v in range(VEHICLE):
+        X += H_v[:, :, v, None] * P_vl[v, :, None]
+    for i in range(SLOT):
+        X += H_l[:, :, i, None] * P_ll[:, None, i]
 
     def element(a, b):
         of_vehicle = jnp.sum(HP_vv[:, a] * H_v[:, b], axis=1)

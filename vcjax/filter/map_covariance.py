@@ -3,7 +3,7 @@
 P_mm is symmetric, so only half of it needs to be kept. It is divided into square tiles of `SLOTS_PER_BLOCK` slots; the
 tiles on and below the diagonal are current, those above hold numbers that nobody may read. A downdate works through
 the lower tiles of the slots in use, one small product each that stays in cache, and what reads rows takes the part to
-the right of the diagonal tile from the columns instead. The arithmetic of what is kept is that of P_mm - UᵀU, to the bit.
+the right of the diagonal tile from the columns instead. What is kept is P_mm - UᵀU, element by element.
 """
 
 import jax
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 SLOT = 7
 """Error coordinates of a landmark slot."""
-SLOTS_PER_BLOCK = 16
+SLOTS_PER_BLOCK = 12
 """Slots along the side of a tile."""
 TILE = SLOT * SLOTS_PER_BLOCK
 """Rows and columns of a tile."""

@@ -1,13 +1,16 @@
 """The frame's corrections, done exactly on the small part of the state they read: equations (8)–(12).
 
 A frame corrects with K landmarks. Their innovations depend on the vehicle and on these K slots only, n = 14 + 7 K
-coordinates, so the sequential updates run on that submap alone, textbook-fashion, on an n × n covariance that stays in
-cache. The rest of the state follows in one pass. With S = L Lᵀ the innovation covariance of correction j and W = L⁻¹,
+coordinates, so the sequential updates run on that submap alone, on an n × n covariance that stays in cache. The rest of
+the state follows in one pass. With S = L Lᵀ the innovation covariance of correction j and W = L⁻¹,
 
-    u_j = W H_j P,    P ← P - u_jᵀ u_j,    x ← x + u_jᵀ (W z_j),
+    u_j = W H_j P,    P ← P - u_jᵀ u_j,    x ← x + u_jᵀ (W z_j).
 
-and every u_j is a fixed combination of rows of H P⁰, P⁰ the covariance the frame began with: u_j = t_j H P⁰, where
-t_j = W (e_j - (H_j u_<jᵀ) t_<j) has only 2 K numbers. So at the end of the frame
+With P⁰ the covariance the frame began with, P = P⁰ - U_<jᵀ U_<j in correction j, so that P itself is never formed:
+
+    u_j = W (H_j P⁰ - (H_j U_<jᵀ) U_<j) = t_j H P⁰,    t_j = W (e_j - (H_j U_<jᵀ) T_<j).
+
+Every u_j is a combination t_j, of only 2 K numbers, of the rows of H P⁰. So at the end of the frame
 
     U = T H P⁰,    P ← P⁰ - Uᵀ U,    x ← x + Uᵀ w:
 
@@ -40,7 +43,7 @@ class Submap(eqx.Module):
     shift: Float[Array, " n"]
     """Σ K z of the corrections so far, by which the means have moved."""
     P: Float[Array, "n n"]
-    """Covariance, current."""
+    """P⁰, the covariance the frame began with."""
     U: Float[Array, "M n"]
     """Rows u_j of the corrections so far, two for each; M = 2 K."""
     H: Float[Array, "K 2 21"]
@@ -79,15 +82,20 @@ def block(submap: Submap, j: int | Int[Array, ""]) -> Block:
 
 
 def block_cov(submap: Submap, j: int | Int[Array, ""]) -> Float[Array, "21 21"]:
-    """Covariance of the block of candidate j: vehicle and its slot."""
-    columns = block_columns(submap.P, j)
-    return jnp.concatenate([columns[:VEHICLE], jax.lax.dynamic_slice_in_dim(columns, first_row(j), SLOT)])
+    """Current covariance of the block of candidate j: vehicle and its slot."""
+    U = block_columns(submap.U, j)
+    return block_columns(block_rows(submap.P, j), j) - U.T @ U
 
 
 def block_columns(matrix: Float[Array, "rows n"], j: int | Int[Array, ""]) -> Float[Array, "rows 21"]:
     """The columns of vehicle and slot of candidate j."""
     own = jax.lax.dynamic_slice_in_dim(matrix, first_row(j), SLOT, axis=-1)
     return jnp.concatenate([matrix[..., :VEHICLE], own], axis=-1)
+
+
+def block_rows(matrix: Float[Array, "n columns"], j: int | Int[Array, ""]) -> Float[Array, "21 columns"]:
+    """The rows of vehicle and slot of candidate j."""
+    return jnp.concatenate([matrix[:VEHICLE], jax.lax.dynamic_slice_in_dim(matrix, first_row(j), SLOT)])
 
 
 def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Array, "K 7 M"]]:
@@ -134,6 +142,7 @@ def scatter(
     slots = Slots(landmark_means(submap), submap.to_coordinates, submap.is_euclidean)
     slots = settle(config, slots, submap.at_correction, submap.is_corrected)
     vehicle, N = normalise(config, vehicle_mean(submap))
+    NU_v = N @ submap.U[:, :VEHICLE].T
     return eqx.tree_at(
         lambda s: (s.vehicle, s.landmarks, s.to_coordinates, s.is_euclidean, s.P_vv, s.P_vm, s.P_mm),
         state,
@@ -142,8 +151,8 @@ def scatter(
             landmarks.at[slot].set(slots.landmarks),
             state.to_coordinates.at[slot].set(slots.to_coordinates),
             state.is_euclidean.at[slot].set(slots.is_euclidean),
-            N @ submap.P[:VEHICLE, :VEHICLE] @ N.T,
-            N @ state.P_vm - (N @ submap.U[:, :VEHICLE].T) @ U,
+            N @ state.P_vv @ N.T - NU_v @ NU_v.T,
+            N @ state.P_vm - NU_v @ U,
             _downdate(config, state, U),
         ),
     )
