@@ -132,7 +132,7 @@ def test_another_threshold_compiles_nothing_new():
         (dict(th1=0), r"VirtualCorrection\(th1=0.0\): .*positive"),
         (dict(th2=-1.0), r"VirtualCorrection\(th2=-1.0\): .*at least 0"),
         (dict(th2=np.nan), r"VirtualCorrection\(th2=nan\)"),
-        (dict(prior="after"), r"VirtualCorrection\(prior='after'\): choose 'corrected' or 'predicted'"),
+        (dict(prior="after"), r"VirtualCorrection\(prior='after'\): choose one of \('corrected', 'predicted'\)"),
     ],
 )
 def test_bad_input_is_refused_by_name_and_value(fields, message):

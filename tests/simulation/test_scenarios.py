@@ -1,5 +1,6 @@
 """Scenarios: the paper's Table 1 in numbers, the presets of movers, and what is refused."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -81,7 +82,7 @@ BAD_PAPERS = {
     "id negative": (dict(dynamic_set=[-1]), r"Scenario\(movers.ids=\[-1\]\)"),
     "id not whole": (dict(dynamic_set=[1.5]), r"paper\(dynamic_set=\[1.5\]\): .*whole numbers"),
     "f at Nyquist": (dict(oscillation_frequency_hz=5.0), r"frequency_hz=5.0\) is at or above half the .* \(10.0 Hz\)"),
-    "f swept over it": (dict(oscillation_frequency_hz=np.array([3.0, 6.0])), r"frequency_hz=\[3.0, 6.0\]\)"),
+    "f swept over it": (dict(oscillation_frequency_hz=jnp.array([3.0, 6.0])), r"frequency_hz=\[3.0, 6.0\]\)"),
     "f above a low rate": (dict(frame_rate_hz=5.0), r"frequency_hz=3.0\) is at or above"),
     "negative amplitude": (dict(oscillation_amplitude_m=-0.05), r"Oscillation\(amplitude_m=-0.05\)"),
     "negative speed": (dict(dynamic="lateral", dynamic_speed_m_s=-1), r"Movers\(speed_m_s=-1.0\)"),

@@ -4,6 +4,7 @@ import dataclasses
 from functools import cache
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_runs
@@ -98,7 +99,7 @@ def test_paths_reach_every_number_and_nothing_else():
         if "direction" in path:  # which is of unit length: no element changes alone
             continue
         replace_at(base, {path: np.float64(0.25)})
-        replace_at(base, {path: np.array([0.25, 0.3])})
+        replace_at(base, {path: jnp.array([0.25, 0.3])})
 
 
 def test_replaces_leaves_and_elements_together():
@@ -148,6 +149,20 @@ def test_bad_sweep_is_refused_before_anything_compiles(sweep, message, unchecked
     with compilations() as compiled, pytest.raises(ValueError, match=message):
         monte_carlo(tiny_runs.scenario(), tiny_runs.config(), key=KEY, sweep=sweep)
     assert compiled.num == 0
+
+
+def test_values_are_checked_in_float32_too():
+    """Where some of them round to what is refused; they are given on as they are."""
+    sweep = {
+        "config.gate.th1": [9.0, 1e-60],
+        "scenario.odometry_std.5": [0.1, 0.2],
+        "scenario.movers.direction.0": [0.0],
+    }
+    with jax.enable_x64(False):
+        values = check_sweep(experiment(), sweep)
+        with pytest.raises(ValueError, match=r"VirtualCorrection\(th1=-1.0\)"):
+            check_sweep(experiment(), {"config.gate.th1": [9.0, -1.0]})
+    assert {path: listed.tolist() for path, listed in values.items()} == sweep
 
 
 def test_points_are_checked_as_a_grid_not_axis_by_axis():

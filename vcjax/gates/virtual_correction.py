@@ -22,9 +22,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from vcjax.ekf import correct, innovation_cov, mahalanobis
-from vcjax.fields import number, require
-from vcjax.gates.gate import AbstractGate, Candidates, MeasurementModel, Prior, Verdict, harmless
-from vcjax.gates.reprojection import check_prior
+from vcjax.fields import number, require, require_choice
+from vcjax.gates.gate import PRIORS, AbstractGate, Candidates, MeasurementModel, Prior, Verdict, harmless
 
 
 class VirtualCorrection(AbstractGate):
@@ -43,7 +42,7 @@ class VirtualCorrection(AbstractGate):
     def __check_init__(self):
         require(self, "th1", lambda th: th > 0, "a threshold on a squared distance is positive (9.0 is 98.9 %).")
         require(self, "th2", lambda th: th >= 0, "a threshold on a fall of squared distance is at least 0.")
-        check_prior(self)
+        require_choice(self, "prior", PRIORS)
 
     def accepts(self, re1: Float[Array, "..."]) -> Bool[Array, "..."]:
         """RE₁ < Th₁."""

@@ -60,7 +60,7 @@ class Scenario(eqx.Module):
         shape = np.shape(self.landmarks_m)
         if len(shape) < 2 or shape[-1] != 3 or shape[-2] == 0:
             raise ValueError(f"Scenario(landmarks_m) has shape {shape}; give at least one feature, (F, 3) m.")
-        require(self, "landmarks_m", np.isfinite, "features need finite places.")
+        require(self, "landmarks_m", np.isfinite, "features need finite places.", length=None)
         for name, length in (("start", 3), ("increment", 3), ("mount", 6)):
             require(self, name, np.isfinite, "give finite numbers.", length)
         require(self, "odometry_std", lambda s: np.isfinite(s) & (s >= 0), "standard deviations are at least 0.", 6)

@@ -37,6 +37,7 @@ class Movers(eqx.Module):
             "direction",
             lambda d: np.isclose(np.linalg.norm(d, axis=-1), 1.0, atol=1e-6),
             "give a direction of unit length; the speed is a number of its own.",
+            length=3,
         )
         require(
             self, "speed_m_s", lambda v: np.isfinite(v) & (v >= 0), "a speed is at least 0; turn the direction round."
