@@ -56,10 +56,10 @@ class VirtualCorrection(AbstractGate):
 
         is_isolated, candidates = candidates.is_isolated, harmless(candidates)
         re1, re2 = jax.vmap(errors)(candidates.mean, candidates.P, candidates.uv_px)
-        is_dynamic = is_isolated & (re1 - re2 > self.th2)
+        fall = re1 - re2  # NaN, of which nothing can be said, is neither recovered nor dynamic
         return Verdict(
-            is_recovered=is_isolated & ~is_dynamic,
-            is_dynamic=is_dynamic,
+            is_recovered=is_isolated & (fall <= self.th2),
+            is_dynamic=is_isolated & (fall > self.th2),
             re1=jnp.where(is_isolated, re1, np.nan),
             re2=jnp.where(is_isolated, re2, np.nan),
         )
