@@ -80,17 +80,23 @@ def test_movers_have_the_paper_s_direction_and_speed(dynamic, direction):
 
 def test_every_number_is_an_option():
     """Each reaches its place in the scenario, and leaves the others as the named motion has them."""
-    camera = Camera(intrinsics_px=(300, 200, 250, 251), image_size_px=(600, 400), distortion=(0.1, -0.02))
+    usual = paper("curved")
     for option, value in {
         "start": (1.0, 2.0, 30.0),
         "increment": (0.1, 0.02, -1.0),
         "odometry_std": (1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
         "mount": (0.1, 0.2, 0.3, -80.0, 1.0, -70.0),
-        "camera": camera,
     }.items():
-        changed, usual = paper("curved", **{option: value}), paper("curved")
-        np.testing.assert_equal(describe(getattr(changed, option)), describe(value))
+        changed = paper("curved", **{option: value})
+        np.testing.assert_array_equal(getattr(changed, option), value)
         assert describe(replace(changed, **{option: getattr(usual, option)})) == describe(usual)
+    camera = {
+        "intrinsics_px": (300.0, 200.0, 250.0, 251.0),
+        "image_size_px": (600.0, 400.0),
+        "distortion": (0.1, -0.02),
+    }
+    changed = paper("curved", **camera)
+    assert describe(changed) == describe(replace(usual, camera=Camera(**camera)))
 
 
 def test_grid_is_as_asked_for():

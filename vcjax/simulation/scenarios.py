@@ -18,7 +18,6 @@ DynamicSet = Literal["ahead", "near_path"]
 Triple = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
 
-CAMERA = Camera()
 MOUNT: Six = (0.0, 0.0, 0.6, -90.0, 0.0, -90.0)
 # Noise of the odometry per frame: x, y, z (m), rotation about x, y, z (deg).
 ODOMETRY_STD: dict[str, Six] = {
@@ -108,7 +107,9 @@ def paper(
     increment: Triple | None = None,
     odometry_std: Six | None = None,
     mount: Six = MOUNT,
-    camera: Camera = CAMERA,
+    intrinsics_px: tuple[float, float, float, float] = (320.0, 240.0, 320.0, 320.0),
+    image_size_px: tuple[float, float] = (640.0, 480.0),
+    distortion: Sequence[float] = (),
     dynamic_direction: Triple | None = None,
     dynamic_places_m: Sequence[Triple] = (),
     dynamic_drawn: int | None = None,
@@ -137,7 +138,9 @@ def paper(
         increment: the robot's motion per frame instead of its step: x, y (m) and yaw (deg) in its own frame.
         odometry_std: noise of the odometry per frame instead: x, y, z (m), rotation about x, y, z (deg).
         mount: camera in the robot frame: x, y, z (m), roll, pitch, yaw (deg).
-        camera: its calibration.
+        intrinsics_px: the camera's principal point u0, v0 and focal lengths αu, αv, px.
+        image_size_px: its width and height, px.
+        distortion: its radial distortion coefficients d1, d2, …; none by default.
         dynamic_direction: direction of the dynamic features instead of a named motion; its length means nothing.
         dynamic_places_m: the dynamic features by their places x, y, z (m) instead of a set.
         dynamic_drawn: how many dynamic features to draw among all features, instead of a set.
@@ -170,7 +173,7 @@ def paper(
             speed_m_s=0.0 if is_static else dynamic_speed_m_s,
         ),
         oscillation=Oscillation(oscillation_amplitude_m, oscillation_frequency_hz),
-        camera=camera,
+        camera=Camera(intrinsics_px, image_size_px, tuple(distortion)),
         start=place if start is None else start,
         increment=(step_m * x, step_m * y, yaw_deg) if increment is None else increment,
         mount=mount,
