@@ -120,12 +120,11 @@ def require_key(owner: str, key: object) -> None:
     Raises:
         ValueError: naming owner, what was given and remedy.
     """
-    found = _shown(key)
     if isinstance(key, jax.Array):
         is_typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
         if key.shape == () if is_typed else (key.shape == (2,) and key.dtype == np.uint32):
             return
-        found = f"{key.dtype}{list(key.shape)}"
+    found = f"{key.dtype}{list(key.shape)}" if isinstance(key, jax.Array) else _shown(key)
     raise ValueError(f"{owner}(key={found}): give one random key, e.g. jax.random.key(0).")
 
 

@@ -221,6 +221,12 @@ BAD_SCENARIOS = {
     "negative odometry noise": (dict(odometry_std=(0, 0, 0, 0, 0, -0.1)), r"Scenario\(odometry_std=.*-0.1\]\)"),
     "short odometry noise": (dict(odometry_std=(0.1, 0.1)), r"Scenario\(odometry_std\) has shape \(2,\)"),
     "short mount": (dict(mount=(0, 0, 0.6)), r"Scenario\(mount\) has shape \(3,\)"),
+    "no movers": (dict(movers=None), r"Scenario\(movers=None\): give an object of the class Movers"),
+    "camera's numbers": (
+        dict(camera=(320, 240)),
+        r"Scenario\(camera=\(320, 240\)\): give an object of the class Camera",
+    ),
+    "words for features": (dict(landmarks_m="grid"), r"Scenario\(landmarks_m\) has shape \(\)"),
     "no start": (dict(start=(0, np.nan, 0)), r"Scenario\(start=\[0.0, nan, 0.0\]\)"),
 }
 
@@ -231,6 +237,12 @@ def test_bad_scenario_is_refused_by_name_and_value(fields, message):
     movers = Movers(np.array([0]))
     with pytest.raises(ValueError, match=message):
         Scenario(**dict(landmarks_m=grid(), movers=movers, camera=Camera(), oscillation=Oscillation()) | fields)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_features_may_be_listed():
+    scenario = Scenario(landmarks_m=[(4, 0, 1), (4, 1, 1)], movers=Movers([1]))
+    assert scenario.landmarks_m.dtype == np.float64 and scenario.landmarks_m.shape == (2, 3)
 
 
 def test_bad_direction_is_refused():

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from vcjax.fields import is_concrete, number, require, require_count, vector
+from vcjax.fields import is_concrete, number, require, require_count, require_kind, vector
 from vcjax.models.camera import Camera
 from vcjax.models.motion import Oscillation
 from vcjax.simulation.world import Movers, features_at, features_drawn, grid, is_feature
@@ -42,7 +42,7 @@ ROBOT_MOTIONS = {
 class Scenario(eqx.Module):
     """A simulated experiment: robot, camera, oscillation, features, movers and noise."""
 
-    landmarks_m: Float[Array | np.ndarray, "F 3"]
+    landmarks_m: Float[Array | np.ndarray, "F 3"] = eqx.field(converter=vector)
     """Features at time 0, m. A feature's number is its track id."""
     movers: Movers
     """Which of them move, and how."""
@@ -66,6 +66,8 @@ class Scenario(eqx.Module):
     """Frames in a run."""
 
     def __check_init__(self):
+        for name, kind in (("movers", Movers), ("oscillation", Oscillation), ("camera", Camera)):
+            require_kind("Scenario", name, getattr(self, name), kind, f"give an object of the class {kind.__name__}.")
         shape = np.shape(self.landmarks_m)
         if len(shape) < 2 or shape[-1] != 3 or shape[-2] == 0:
             raise ValueError(f"Scenario(landmarks_m) has shape {shape}; give at least one feature, (F, 3) m.")
