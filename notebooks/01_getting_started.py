@@ -40,7 +40,7 @@ from IPython.display import Image, display
 import vcjax as vc
 from vcjax.report.figures import write_figures
 from vcjax.study.paper import Cell
-from vcjax.study.summary import paired_difference, summarise, summary_text
+from vcjax.study.summary import paired_difference
 
 # %% [markdown]
 # ## 1. A scene
@@ -186,7 +186,7 @@ def runs(gate, amplitude_m, **scene):
 re_steady = runs(vc.ReprojectionError(), 0.0)
 vc_steady = runs(vc.VirtualCorrection(), 0.0)
 vc_oscillating = runs(vc.VirtualCorrection(), 0.05)
-print(summary_text(summarise(vc_steady)))
+print(vc.summarise(vc_steady))
 
 # %%
 results = {
@@ -218,7 +218,7 @@ for name, a, b in (("VC - RE, steady", vc_steady, re_steady), ("oscillating - st
 scene = {"dynamic": "inverse_forward", "dynamic_speed_m_s": 0.5}
 found = {}
 for name, amplitude_m in (("steady", 0.0), ("oscillating", 0.05)):
-    summary = summarise(runs(vc.VirtualCorrection(), amplitude_m, **scene))
+    summary = vc.summarise(runs(vc.VirtualCorrection(), amplitude_m, **scene))
     found[name], error = summary.dynamic_found_per_run.values
     position, _ = summary.position_rmse_cm.values
     print(f"{name} camera: {found[name]:.2f} ± {error:.2f} of 6 movers found, position error {position:.1f} cm")

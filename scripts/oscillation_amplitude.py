@@ -13,7 +13,6 @@ import tyro
 
 import vcjax as vc
 from vcjax.study.results import save
-from vcjax.study.summary import summarise, summary_text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +41,7 @@ def main(study: Study) -> None:
             key=jax.random.key(0),
             sweep={"scenario.oscillation.amplitude_m": study.amplitudes_m},
         )
-        print(f"{name}\n{summary_text(summarise(runs))}")
+        print(f"{name}\n{vc.summarise(runs)}")
         print(f"wrote {save(runs, study.out / f'{name}.nc')}")
 
 

@@ -13,7 +13,6 @@ import tyro
 
 import vcjax as vc
 from vcjax.study.results import save
-from vcjax.study.summary import summarise, summary_text
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +46,7 @@ def main(study: Study) -> None:
         key=jax.random.key(0),
         sweep={"config.gate.th1": study.th1, "config.gate.th2": study.th2},
     )
-    print(summary_text(summarise(runs)))
+    print(vc.summarise(runs))
     print(f"wrote {save(runs, study.out)}")
 
 

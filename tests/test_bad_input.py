@@ -89,6 +89,20 @@ BAD_CONFIGURATIONS = {
     "no pixel noise": (dict(pixel_std_px=0.0), r"FilterConfig\(pixel_std_px=0.0\): give a positive number"),
     "negative sensor noise": (dict(oscillation_std_m=-0.1), r"oscillation_std_m=-0.1\): give a number of at least 0"),
     "no number": (dict(linearity_max=np.nan), r"FilterConfig\(linearity_max=nan\)"),
+    "a gate's name": (
+        dict(gate="VC"),
+        r"FilterConfig\(gate='VC'\): give a gate, e.g. VirtualCorrection\(\) or ReprojectionError\(\)",
+    ),
+    "a gate's class": (dict(gate=vc.VirtualCorrection), r"FilterConfig\(gate=<.*>\): give a gate, e.g. Virtual"),
+    "no detector": (dict(detector=None), r"FilterConfig\(detector=None\): give a detector, e.g. InlierRatio\(\)"),
+    **{
+        f"{name} a word": (dict([(name, "no")]), rf"FilterConfig\({name}='no'\): choose one of \(True, False\)")
+        for name in ("retire", "skip_free_slots", "reverse_mode", "toolbox_parity")
+    },
+    "many pixel noises": (
+        dict(pixel_std_px=np.ones(3)),
+        r"FilterConfig\(pixel_std_px\) has shape \(3,\), but one number is needed: .* `sweep` of `monte_carlo`",
+    ),
     "unknown update": (
         dict(update="both"),
         r"FilterConfig\(update='both'\): choose one of \('sequential', 'stacked'\)",
@@ -109,6 +123,54 @@ def test_gates_are_refused(gate):
         for th1 in (0.0, -9.0, np.nan):
             with pytest.raises(ValueError, match=rf"{gate.__name__}\(th1={th1}\): a threshold .* is positive"):
                 gate(th1=th1)
-        with pytest.raises(ValueError, match=rf"{gate.__name__}\(prior='before'\): choose 'corrected' or 'predicted'"):
+        with pytest.raises(ValueError, match=rf"{gate.__name__}\(prior='before'\): choose one of \('corrected', 'pre"):
             gate(prior="before")
+        with pytest.raises(ValueError, match=rf"{gate.__name__}\(th1\) has shape \(2,\), but one number is needed"):
+            gate(th1=[9, 9])
+    assert compiled.num == 0
+
+
+KEY = jax.random.key(0)
+MANY_KEYS = jax.random.PRNGKey(0)[:, None]
+CALLS = {
+    "run without configuration": (lambda r: vc.run(None, r), r"run\(config=None\): give a FilterConfig"),
+    "run with the class": (lambda r: vc.run(vc.FilterConfig, r), r"run\(config=.*\): give a FilterConfig"),
+    "run the other way round": (lambda r: vc.run(r, vc.FilterConfig()), r"run\(config=<Recording>\): give a Filter"),
+    "run without recording": (lambda r: vc.run(tiny_runs.config(), None), r"run\(recording=None\): give a Recording"),
+    "run with a number for a key": (
+        lambda r: vc.run(tiny_runs.config(birth_order="random"), r, 5),
+        r"run\(key=5\): give one random key, e.g. jax.random.key\(0\)",
+    ),
+    "start without configuration": (lambda r: vc.start(None, r), r"start\(config=None\): give a FilterConfig"),
+    "start without recording": (
+        lambda r: vc.start(tiny_runs.config(), "tracks.csv"),
+        r"recording='tracks.csv'\): give",
+    ),
+    "start with many keys": (
+        lambda r: vc.start(tiny_runs.config(birth_order="random"), r, MANY_KEYS),
+        r"start\(key=uint32\[2, 1\]\): give one random key",
+    ),
+    "simulate nothing": (lambda r: vc.simulate(None, KEY), r"simulate\(scenario=None\): give a Scenario, e.g. .*paper"),
+    "simulate without key": (
+        lambda r: vc.simulate(tiny_runs.scenario(), None),
+        r"simulate\(key=None\): give one random",
+    ),
+    "simulate with a seed": (lambda r: vc.simulate(tiny_runs.scenario(), 0), r"simulate\(key=0\): give one random key"),
+    "many runs of nothing": (lambda r: vc.monte_carlo(None, key=KEY), r"monte_carlo\(scenario=None\): give a Scenario"),
+    "many runs of a recording": (lambda r: vc.monte_carlo(r, key=KEY), r"monte_carlo\(scenario=<Recording>\): give a"),
+    "many runs with a gate": (
+        lambda r: vc.monte_carlo(tiny_runs.scenario(), vc.VirtualCorrection(), key=KEY),
+        r"monte_carlo\(config=.*VirtualCorrection.*\): give a FilterConfig",
+    ),
+    "many runs without key": (
+        lambda r: vc.monte_carlo(tiny_runs.scenario(), key=None),
+        r"monte_carlo\(key=None\): give one random key",
+    ),
+}
+
+
+@pytest.mark.parametrize(("call", "message"), CALLS.values(), ids=CALLS)
+def test_what_is_of_another_kind_is_refused(call, message, recording):
+    with compilations() as compiled, pytest.raises(ValueError, match=message):
+        call(recording)
     assert compiled.num == 0

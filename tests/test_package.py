@@ -79,10 +79,20 @@ def test_files_are_short_and_say_what_they_are(module):
 
 def test_public_names_are_documented():
     tree = ast.parse((PACKAGE / "__init__.py").read_text())
-    exports = [alias for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    exports = [alias for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
     assert all(alias.asname == alias.name for alias in exports)  # `X as X`: exported on purpose
     names = {alias.name for alias in exports}
-    assert {"FilterConfig", "Scenario", "simulate", "run", "step", "start", "monte_carlo", "scenarios"} <= names
+    assert {
+        "FilterConfig",
+        "Scenario",
+        "simulate",
+        "run",
+        "step",
+        "start",
+        "monte_carlo",
+        "scenarios",
+        "summarise",
+    } <= names
     for name in names:
         public = getattr(vcjax, name)
         assert inspect.getdoc(public) and public.__doc__, name  # its own, not one it inherits
@@ -136,9 +146,17 @@ try:
     vcjax.monte_carlo(vcjax.scenarios.paper(), num_seeds=1, key=jax.random.key(0))
 except ModuleNotFoundError as error:
     print(error)
+try:
+    vcjax.summarise(None)
+except ModuleNotFoundError as error:
+    print(error)
+assert not hasattr(vcjax, "sumarise")
 """
     )
-    assert told == "Labelled results need xarray: pip install 'vcjax[study]'."
+    assert told == (
+        "Labelled results need xarray: pip install 'vcjax[study]'.\n"
+        "vcjax.summarise needs xarray: pip install 'vcjax[study]'."
+    )
 
 
 def test_command_tells_what_it_lacks():

@@ -1,6 +1,7 @@
 """Recordings: the good one is accepted, each kind of bad one is refused by field, place and value."""
 
-import equinox as eqx
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,8 +15,7 @@ from vcjax.recording import Recording, last_sightings, validate
 T, V = 5, 4
 
 
-@pytest.fixture
-def recording():
+def good_recording() -> Recording:
     """A good recording in NumPy: anything may stand where nothing is valid."""
     rng = np.random.default_rng(0)
     is_valid = np.arange(V) != np.arange(T)[:, None]
@@ -37,12 +37,17 @@ def recording():
     )
 
 
+@pytest.fixture
+def recording():
+    return good_recording()
+
+
 def changed(recording, name, value, place=None):
     """The recording with another field, or another value at one place of it."""
     if place is not None:
         value, old = getattr(recording, name).copy(), value
         value[place] = old
-    return eqx.tree_at(lambda r: getattr(r, name), recording, value)
+    return dataclasses.replace(recording, **{name: value})
 
 
 def test_good_recording_is_accepted(recording):
@@ -79,11 +84,19 @@ BAD_VALUES = {
     "time standing still": ("time_s", 0.2, 2, r"time_s\[2\] = 0.2\): times must grow"),
     "negative odometry variance": ("odometry_cov", -1.0, (4, 5, 5), r"odometry_cov\[4, 5, 5\] = -1.0\): variances"),
     "negative start variance": ("start_cov", -1.0, (13, 13), r"start_cov\[13, 13\] = -1.0\): variances"),
+    "skew odometry covariance": (
+        "odometry_cov",
+        1e-8,
+        (3, 4, 5),
+        r"odometry_cov\[3, 4, 5\] = 1e-08\): differs from its mirror element; .* symmetric",
+    ),
+    "skew start covariance": ("start_cov", 1e-3, (2, 0), r"start_cov\[0, 2\] = 0.0\): differs from its mirror element"),
     "long quaternion": ("robot_start", 2.0, 3, r"Recording\(robot_start\): the quaternion has length 2.0"),
     "short quaternion": ("sensor_start", 0.0, 4, r"Recording\(sensor_start\): the quaternion has length 0.866"),
 }
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(("name", "value", "place", "message"), BAD_VALUES.values(), ids=BAD_VALUES)
 def test_bad_value_is_refused_with_its_place(recording, name, value, place, message):
     with pytest.raises(ValueError, match=message):
@@ -104,16 +117,51 @@ BAD_FIELDS = {
     "planar start": ("robot_start", np.zeros(3), r"robot_start\) has shape \(3,\), but \(7,\)"),
     "planar mount": ("sensor_start", np.zeros(3), r"sensor_start\) has shape \(3,\)"),
     "robot's covariance only": ("start_cov", np.zeros((7, 7)), r"start_cov\) has shape \(7, 7\), but \(14, 14\)"),
+    "no column": (
+        "track_id",
+        np.zeros((T, 0), int),
+        r"track_id\) has shape \(5, 0\): no column .*give one column that is marked invalid",
+    ),
+    "list of odometry": ("odometry", [[0.0] * 6] * T, r"Recording\(odometry\) is a list; give a NumPy or JAX array"),
+    "no times": ("time_s", None, r"Recording\(time_s\) is a NoneType; give a NumPy or JAX array"),
+    "name for pixels": ("uv_px", "pixels.npy", r"Recording\(uv_px\) is a str; give a NumPy or JAX array"),
+    "words for times": ("time_s", np.array(["a"] * T), r"Recording\(time_s\) is <U1; give real numbers"),
+    "objects for odometry": ("odometry", np.zeros((T, 6), object), r"Recording\(odometry\) is object; give real"),
+    "complex shift": ("sensor_shift_m", np.zeros((T, 3), complex), r"Recording\(sensor_shift_m\) is complex128; give"),
+    "no camera": ("camera", None, r"Recording\(camera=None\): give a vcjax.Camera"),
+    "camera's numbers": ("camera", (320.0, 240.0), r"Recording\(camera=\(320.0, 240.0\)\): give a vcjax.Camera"),
     "fractional ids": ("track_id", np.zeros((T, V)), r"track_id\) is float64; ids are integers"),
     "mask of numbers": ("is_valid", np.ones((T, V), int), r"is_valid\) is int64; give booleans"),
     "last of numbers": ("is_last", np.ones((T, V)), r"is_last\) is float64; give booleans"),
 }
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(("name", "value", "message"), BAD_FIELDS.values(), ids=BAD_FIELDS)
 def test_bad_field_is_refused_with_what_is_needed(recording, name, value, message):
     with pytest.raises(ValueError, match=message):
         validate(changed(recording, name, value))
+
+
+def test_impossible_covariance_is_refused_with_its_frame_and_eigenvalue(recording):
+    bad = recording.odometry_cov.copy()
+    bad[3, :2, :2] = [[1e-6, 2e-6], [2e-6, 1e-6]]
+    with pytest.raises(ValueError, match=r"odometry_cov\[3\]\) has the eigenvalue -1e-06: .* none below 0; check its"):
+        validate(changed(recording, "odometry_cov", bad))
+    start = np.zeros((14, 14))
+    start[:2, :2] = [[1.0, 1.1], [1.1, 1.0]]
+    with pytest.raises(ValueError, match=r"Recording\(start_cov\) has the eigenvalue -0.1"):
+        validate(changed(recording, "start_cov", start))
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-9, 1e6), st.integers(1, 14))
+def test_covariances_with_rounding_are_accepted(seed, scale, rank):
+    """Of any rank and size, also as float32."""
+    A = np.random.default_rng(seed).normal(size=(14, rank))
+    for dtype in (np.float64, np.float32):
+        start_cov = (scale * A @ A.T).astype(dtype)
+        odometry_cov = np.stack([start_cov[:6, :6]] * T)
+        validate(dataclasses.replace(good_recording(), odometry_cov=odometry_cov, start_cov=start_cov))
 
 
 @given(st.integers(0, 2**32 - 1))

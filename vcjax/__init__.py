@@ -5,6 +5,8 @@ nothing, starts no device and leaves JAX's configuration alone; for the paper's 
 `jax.config.update("jax_enable_x64", True)`.
 """
 
+import typing
+
 from vcjax.filter.config import FilterConfig as FilterConfig
 from vcjax.filter.slam import FrameInfo as FrameInfo
 from vcjax.filter.slam import run as run
@@ -22,3 +24,17 @@ from vcjax.simulation import scenarios as scenarios
 from vcjax.simulation.scenarios import Scenario as Scenario
 from vcjax.simulation.simulate import simulate as simulate
 from vcjax.study.monte_carlo import monte_carlo as monte_carlo
+
+if typing.TYPE_CHECKING:
+    from vcjax.study.summary import summarise as summarise
+
+
+def __getattr__(name: str) -> typing.Any:
+    """`summarise`, imported when it is first asked for: it needs the extra `study`, which importing must not."""
+    if name != "summarise":
+        raise AttributeError(f"module 'vcjax' has no attribute {name!r}")
+    try:
+        from vcjax.study.summary import summarise as summarise
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"vcjax.summarise needs {error.name}: pip install 'vcjax[study]'.") from error
+    return summarise

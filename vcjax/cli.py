@@ -2,8 +2,10 @@
 
 import contextlib
 import dataclasses
+import io
 import os
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -22,7 +24,7 @@ from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.reproduce import GATES, load_results, reproduce
 from vcjax.study.results import save
 from vcjax.study.storage import check_writable
-from vcjax.study.summary import summarise, summary_text
+from vcjax.study.summary import summarise
 
 GateName = Literal["RE", "VC"]
 
@@ -31,7 +33,8 @@ GateName = Literal["RE", "VC"]
 class Reproduce:
     """Run all experiments of the paper's Tables 2-5 and write tables and figures beside the paper's numbers.
 
-    What DIR holds already is not run again: a stopped run continues, and more seeds extend fewer.
+    What DIR holds already is not run again: a stopped run continues, more seeds extend fewer, and tables run before are
+    reported with the others.
     """
 
     seeds: int = 25
@@ -48,14 +51,14 @@ class Reproduce:
     def __call__(self, console: Console) -> None:
         """Run, then report."""
         with _progress(console, "compiling, first cell") as show:
-            results = reproduce(
+            reproduce(
                 self.out,
                 num_seeds=self.seeds,
                 tables=self.tables,
                 key=_key(self.key),
                 progress=lambda done, total, cell: show(done, total, f"table {cell.table}, {cell.case}, {cell.method}"),
             )
-        _report(results, self.out, console)
+        _report(load_results(self.out), self.out, console)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +97,7 @@ class Run:
         check_writable(self.out)
         with _progress(console, "running") as show:
             runs = monte_carlo(self.scenario, self.config, num_seeds=self.seeds, key=_key(self.key), progress=show)
-        print(summary_text(summarise(runs)))
+        print(summarise(runs))
         _say(console, f"wrote {save(runs, self.out)}")
 
 
@@ -128,13 +131,35 @@ def _parse(arguments: list[str]) -> Reproduce | Report | Run:
         | Annotated[Report, tyro.conf.subcommand("report")]
         | Annotated[Run, tyro.conf.subcommand("run", default=default)]
     )
-    return tyro.cli(
-        union,  # type: ignore[arg-type]
-        args=arguments,
-        prog="vcjax",
-        description="Which image features belong to moving things, and how should a camera move to find out?",
-        config=(tyro.conf.OmitArgPrefixes,),
-    )
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            return tyro.cli(
+                union,  # type: ignore[arg-type]
+                args=arguments,
+                prog="vcjax",
+                description="Which image features belong to moving things, and how should a camera move to find out?",
+                config=(tyro.conf.OmitArgPrefixes,),
+            )
+    except SystemExit as stop:
+        if refusal := _refusal(stop):
+            raise refusal from None
+        sys.stderr.write(told.getvalue())
+        raise
+
+
+def _refusal(stop: BaseException) -> ValueError | None:
+    """What this package refused while the parser built a scenario or configuration, if that is why it stopped.
+
+    The parser would put it into its box behind a name of its own making.
+    """
+    error = stop.__context__
+    while error is not None:
+        places = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+        if isinstance(error, ValueError) and places and places[-1].startswith("vcjax."):
+            return error
+        error = error.__context__
+    return None
 
 
 def _gate_name(arguments: list[str]) -> str:

@@ -2,32 +2,35 @@
 
 A Python float is static under `equinox.filter_jit`, so that every new threshold would compile anew. These converters
 store NumPy numbers, which are traced; they start no JAX device, so configurations can be built at import. Values that
-are already JAX arrays (a tracer, a swept batch) pass through unchecked. So does what is no number: a converter knows
-no name, and `require` refuses it by field and value.
+are already JAX arrays (a tracer, a batch for `vmap`) pass through. So does what is no number, or not one number: a
+converter knows no name, and `require` refuses it by field and value.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import Any
 
+import jax
 import jax.core
+import jax.numpy as jnp
 import numpy as np
 
 
 def number(value: Any) -> Any:
-    """A traced number: `numpy.float64` of a Python number; arrays pass through."""
-    if isinstance(value, (jax.Array, np.ndarray)):
+    """A traced number: `numpy.float64` of a Python number or of an array of one; JAX arrays pass through."""
+    if value is None or isinstance(value, jax.Array):
         return value
     try:
-        return np.float64(value)
+        array = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         return value
+    return np.float64(array.item()) if array.size == 1 else array
 
 
 def vector(value: Any) -> Any:
-    """A traced vector: float64 NumPy array of Python numbers; JAX arrays pass through."""
-    if isinstance(value, jax.Array):
-        return value
+    """A traced vector: float64 NumPy array of Python numbers; JAX arrays pass through, and make one with others."""
+    if any(isinstance(part, jax.Array) for part in jax.tree.leaves(value)):
+        return jnp.asarray(value)
     try:
         return np.asarray(value, np.float64)
     except (TypeError, ValueError):
@@ -40,7 +43,7 @@ def is_concrete(value: Any) -> bool:
 
 
 def require(
-    owner: object, name: str, condition: Callable[[np.ndarray], Any], remedy: str, length: int | None = None
+    owner: object, name: str, condition: Callable[[np.ndarray], Any], remedy: str, length: int | None = 0
 ) -> None:
     """Refuse a field whose value breaks a condition, naming class, field, value and remedy.
 
@@ -49,10 +52,11 @@ def require(
         name: its field.
         condition: from the value as a NumPy array to true where it is acceptable; NaN is never acceptable.
         remedy: what to give instead.
-        length: how many numbers a vector must have (its last axis); None: any.
+        length: 0 for a number; for a vector how many numbers it must have; None: any shape. JAX arrays may have
+            leading axes, as batches for `vmap`.
 
     Raises:
-        ValueError: if it has another length, any element is no number, NaN or breaks the condition. Of traced values
+        ValueError: if it has another shape, any element is no number, NaN or breaks the condition. Of traced values
             only the length is checked.
     """
     value, owner_name = getattr(owner, name), type(owner).__name__
@@ -60,8 +64,13 @@ def require(
         array = np.asarray(value, np.float64) if is_concrete(value) else value
     except (TypeError, ValueError):
         raise ValueError(f"{owner_name}({name}={value!r}) is no number: {remedy}") from None
-    if length is not None and array.shape[-1:] != (length,):
+    if length and array.shape[-1:] != (length,):
         raise ValueError(f"{owner_name}({name}) has shape {array.shape}, but {length} numbers are needed: {remedy}")
+    if length is not None and not isinstance(value, jax.Array) and array.ndim != (length > 0):
+        raise ValueError(
+            f"{owner_name}({name}) has shape {array.shape}, but {'one vector' if length else 'one number'} is needed: "
+            "for several values use `sweep` of `monte_carlo`, or a JAX array and `jax.vmap`."
+        )
     if is_concrete(value) and (np.any(np.isnan(array)) or not np.all(condition(array))):
         raise ValueError(f"{owner_name}({name}={np.asarray(value).tolist()}): {remedy}")
 
@@ -73,5 +82,53 @@ def require_count(owner: object, name: str, minimum: int) -> None:
         ValueError: naming class, field, value and remedy.
     """
     value = getattr(owner, name)
-    if not isinstance(value, Integral) or value < minimum:
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < minimum:
         raise ValueError(f"{type(owner).__name__}({name}={value!r}): give a whole number of at least {minimum}.")
+
+
+def require_choice(owner: object, name: str, choices: Sequence[str | bool]) -> None:
+    """Refuse a static field that is none of the choices.
+
+    Raises:
+        ValueError: naming class, field, value and the choices.
+    """
+    value = getattr(owner, name)
+    if not any(type(value) is type(choice) and value == choice for choice in choices):
+        raise ValueError(f"{type(owner).__name__}({name}={value!r}): choose one of {tuple(choices)}.")
+
+
+def require_kind(owner: str, name: str, value: object, kind: type, remedy: str) -> None:
+    """Refuse an argument or field that is of another class than is needed.
+
+    Args:
+        owner: the function or class it is given to.
+        name: its name there.
+        value: what was given.
+        kind: the class it must be of.
+        remedy: what to give instead.
+
+    Raises:
+        ValueError: naming owner, name, what was given and remedy.
+    """
+    if not isinstance(value, kind):
+        raise ValueError(f"{owner}({name}={_shown(value)}): {remedy}")
+
+
+def require_key(owner: str, key: object) -> None:
+    """Refuse what is not one random key, new style or raw (two unsigned numbers of 32 bits).
+
+    Raises:
+        ValueError: naming owner, what was given and remedy.
+    """
+    if isinstance(key, jax.Array):
+        is_typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
+        if key.shape == () if is_typed else (key.shape == (2,) and key.dtype == np.uint32):
+            return
+    found = f"{key.dtype}{list(key.shape)}" if isinstance(key, jax.Array) else _shown(key)
+    raise ValueError(f"{owner}(key={found}): give one random key, e.g. jax.random.key(0).")
+
+
+def _shown(value: object) -> str:
+    """A value in a message: as Python shows it, or its class where that is long."""
+    text = repr(value)
+    return text if len(text) <= 60 and "\n" not in text else f"<{type(value).__name__}>"

@@ -12,11 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vcjax.fields import is_concrete
+from vcjax.fields import is_concrete, require_kind
 from vcjax.models.camera import Camera
 
 # A recording may be kept in NumPy; `Recording.frame` hands out JAX arrays.
 AnyArray = Array | np.ndarray
+
+COVARIANCE_TOLERANCE = 1e-5
+"""Rounding left to a covariance, relative to its largest element: what 14 × 14 numbers of float32 need, tenfold."""
 
 
 class Frame(eqx.Module):
@@ -107,18 +110,26 @@ def validate(recording: Recording) -> None:
     """Refuse a recording that no filter can run on.
 
     Raises:
-        ValueError: naming field, place, value and remedy: shapes that disagree, no frames, times that do not grow, a
-            non-finite number where one is needed (pixels count only where valid), negative or repeated ids in a frame,
-            a last sighting that is not the last, covariances with negative diagonal, quaternions that are not of unit
-            length. Traced recordings are not checked.
+        ValueError: naming field, place, value and remedy: no recording, fields that are no arrays of numbers, shapes
+            that disagree, no frames or no columns, times that do not grow, a non-finite number where one is needed
+            (pixels count only where valid), negative or repeated ids in a frame, a last sighting that is not the last,
+            covariances that are not symmetric or have a negative eigenvalue, quaternions that are not of unit length.
+            Traced recordings are not checked.
     """
+    require_kind("run", "recording", recording, Recording, "give a Recording, as vcjax.simulate makes one.")
     leaves = jax.tree.leaves(recording)
     if not all(is_concrete(leaf) for leaf in leaves):
         return
+    _refuse_types(recording)
     num_frames = np.shape(recording.time_s)[0] if np.ndim(recording.time_s) == 1 else "T"
     if num_frames == 0:
         raise ValueError("Recording(time_s=[]): the recording is empty; give at least one frame.")
     num_features = np.shape(recording.track_id)[-1] if np.ndim(recording.track_id) == 2 else "V"
+    if num_features == 0:
+        raise ValueError(
+            f"Recording(track_id) has shape {np.shape(recording.track_id)}: no column for features; "
+            "where none is seen, give one column that is marked invalid throughout."
+        )
     shapes = {
         "time_s": (num_frames,),
         "odometry": (num_frames, 6),
@@ -138,7 +149,6 @@ def validate(recording: Recording) -> None:
             raise ValueError(
                 f"Recording({name}) has shape {found}, but {shape} is needed (T frames first, from time_s)."
             )
-    _refuse_types(recording)
     for name in ("time_s", "odometry", "odometry_cov", "sensor_shift_m", "robot_start", "sensor_start", "start_cov"):
         _refuse_where(~np.isfinite(getattr(recording, name)), name, recording, "must be finite.")
 
@@ -155,8 +165,7 @@ def validate(recording: Recording) -> None:
     _refuse_where(reappears, "is_last", recording, "its track is seen again; see last_sightings.")
     _refuse_where(np.diff(recording.time_s, prepend=-np.inf) <= 0, "time_s", recording, "times must grow.")
     for name in ("odometry_cov", "start_cov"):
-        cov = np.asarray(getattr(recording, name))
-        _refuse_where((cov < 0) & np.eye(cov.shape[-1], dtype=bool), name, recording, "variances are at least 0.")
+        _refuse_covariance(name, recording)
     for name in ("robot_start", "sensor_start"):
         norm = float(np.linalg.norm(np.asarray(getattr(recording, name))[3:]))
         if abs(norm - 1.0) > 1e-3:
@@ -172,12 +181,36 @@ def validate(recording: Recording) -> None:
 
 
 def _refuse_types(recording: Recording) -> None:
-    """Refuse ids that are no integers and masks that are no booleans."""
-    if not jnp.issubdtype(recording.track_id.dtype, jnp.integer):
-        raise ValueError(f"Recording(track_id) is {recording.track_id.dtype}; ids are integers.")
-    for name in ("is_valid", "is_last"):
-        if getattr(recording, name).dtype != bool:
-            raise ValueError(f"Recording({name}) is {getattr(recording, name).dtype}; give booleans.")
+    """Refuse what is no array of numbers, ids that are no integers, masks that are no booleans, no camera."""
+    for name in (field.name for field in dataclasses.fields(Recording) if field.name != "camera"):
+        value = getattr(recording, name)
+        if not isinstance(value, jax.Array | np.ndarray):
+            raise ValueError(f"Recording({name}) is a {type(value).__name__}; give a NumPy or JAX array.")
+        kind, needed = {
+            "track_id": (jnp.integer, "ids are integers"),
+            "is_valid": (jnp.bool_, "give booleans"),
+            "is_last": (jnp.bool_, "give booleans"),
+        }.get(name, (jnp.number, "give real numbers"))
+        if not jnp.issubdtype(value.dtype, kind) or jnp.issubdtype(value.dtype, jnp.complexfloating):
+            raise ValueError(f"Recording({name}) is {value.dtype}; {needed}.")
+    require_kind("Recording", "camera", recording.camera, Camera, "give a vcjax.Camera.")
+
+
+def _refuse_covariance(name: str, recording: Recording) -> None:
+    """Refuse covariances with a negative variance, or beyond rounding not symmetric or with a negative eigenvalue."""
+    cov = np.asarray(getattr(recording, name), np.float64)
+    _refuse_where((cov < 0) & np.eye(cov.shape[-1], dtype=bool), name, recording, "variances are at least 0.")
+    tolerance = COVARIANCE_TOLERANCE * np.max(np.abs(cov), axis=(-2, -1))
+    is_skew = np.abs(cov - cov.mT) > tolerance[..., None, None]
+    _refuse_where(is_skew, name, recording, "differs from its mirror element; a covariance P is symmetric, (P + Pᵀ)/2.")
+    smallest = np.atleast_1d(np.linalg.eigvalsh(cov)[..., 0])
+    frames = np.flatnonzero(smallest < -tolerance)
+    if len(frames):
+        place = f"{name}[{frames[0]}]" if cov.ndim == 3 else name
+        raise ValueError(
+            f"Recording({place}) has the eigenvalue {smallest[frames[0]]:.3g}: a covariance has none below 0; "
+            f"check its correlations, which lie in [-1, 1] ({len(frames)} such places)"
+        )
 
 
 def _refuse_where(is_bad: np.ndarray, name: str, recording: Recording, remedy: str) -> None:

@@ -38,7 +38,7 @@ def test_another_threshold_compiles_nothing_new():
         (dict(th1=0.0), r"ReprojectionError\(th1=0.0\): .*positive"),
         (dict(th1=-9), r"ReprojectionError\(th1=-9.0\)"),
         (dict(th1=np.nan), r"ReprojectionError\(th1=nan\)"),
-        (dict(prior="after"), r"ReprojectionError\(prior='after'\): choose 'corrected' or 'predicted'"),
+        (dict(prior="after"), r"ReprojectionError\(prior='after'\): choose one of \('corrected', 'predicted'\)"),
     ],
 )
 def test_bad_input_is_refused_by_name_and_value(fields, message):

@@ -118,6 +118,21 @@ def test_masked_candidates_are_inert_in_value_and_gradient(rubbish, mask):
     assert np.any(gradient[1][0] != 0) == np.any(mask[0])
 
 
+@pytest.mark.parametrize("place", ["mean", "P", "uv_px"])
+def test_a_candidate_of_which_nothing_can_be_said_is_neither_recovered_nor_dynamic(place):
+    candidates = linear_candidates(7)
+    bad = eqx.tree_at(
+        lambda c: getattr(c, place),
+        candidates,
+        jax.tree.map(lambda leaf: leaf.at[2].set(jnp.nan), getattr(candidates, place)),
+    )
+    verdict, expected = judge(VirtualCorrection(), bad), judge(VirtualCorrection(), candidates)
+    assert np.isnan(verdict.re1[2]) and not verdict.is_recovered[2] and not verdict.is_dynamic[2]
+    others = np.arange(8) != 2
+    np.testing.assert_array_equal(verdict.is_recovered, expected.is_recovered & others)
+    np.testing.assert_array_equal(verdict.is_dynamic, expected.is_dynamic & others)
+
+
 def test_another_threshold_compiles_nothing_new():
     once = jax.jit(eqx.debug.assert_max_traces(lambda gate, c: gate.judge(c, MODEL).is_dynamic, max_traces=1))
     candidates = linear_candidates(6)
@@ -132,7 +147,7 @@ def test_another_threshold_compiles_nothing_new():
         (dict(th1=0), r"VirtualCorrection\(th1=0.0\): .*positive"),
         (dict(th2=-1.0), r"VirtualCorrection\(th2=-1.0\): .*at least 0"),
         (dict(th2=np.nan), r"VirtualCorrection\(th2=nan\)"),
-        (dict(prior="after"), r"VirtualCorrection\(prior='after'\): choose 'corrected' or 'predicted'"),
+        (dict(prior="after"), r"VirtualCorrection\(prior='after'\): choose one of \('corrected', 'predicted'\)"),
     ],
 )
 def test_bad_input_is_refused_by_name_and_value(fields, message):

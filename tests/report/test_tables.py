@@ -91,7 +91,15 @@ def test_one_seed_is_null_in_json_and_decides_nothing(tmp_path):
     assert found["cells"][0]["position_rmse_cm"]["se"] is None
     assert found["paired"][0]["position_rmse_cm"]["interval_95"] == [None, None]
     assert "support 0, contradict 0 and do not decide" in text
-    assert "nan" not in text
+    assert "nan" not in text and "\n1 run per cell." in text
+
+
+def test_figure_that_is_not_defined_is_null_in_json_and_a_dash_in_text(tmp_path):
+    runs = fake_runs(VC, 3)
+    found, text = written({VC: runs.assign(nees_position=np.nan * runs.nees_position), RE: fake_runs(RE, 3)}, tmp_path)
+    assert found["cells"][1]["anees_position"] is None and found["cells"][1]["runs_failed"] == 0
+    row = next(line for line in text.splitlines() if line.startswith("| forward | VC, steady camera |"))
+    assert row.endswith("| – | 3, 0 failed |") and "nan" not in text
 
 
 def test_failed_seeds_are_counted_and_left_out(tmp_path):

@@ -173,3 +173,17 @@ def test_flags_sum_up_the_frames(run_and_truth, metrics):
     )
     flagged = run_metrics(*as_jax((flags, truth)))
     assert not flagged["is_finite"] and flagged["map_full_frames"] == 3
+
+
+def test_nees_is_not_defined_where_the_covariance_is_singular(run_and_truth, metrics):
+    """All of it zero, without odometry noise; of x; of yaw; or x and y known up to one direction, rounding included."""
+    info, truth = run_and_truth
+    cov = np.array(info.vehicle_cov)
+    cov[1], cov[2, :, 0], cov[2, 0], cov[3, :, 3:7], cov[3, 3:7] = 0, 0, 0, 0, 0
+    cov[4, :2, :2] = np.outer([0.1, 0.3], [0.1, 0.3])
+    cov[5, :2, :2] = np.outer([0.1, 0.3], [0.1, 0.3]) + 1e-18 * np.eye(2)
+    found = errors_of(eqx.tree_at(lambda i: i.vehicle_cov, info, cov), truth)
+    for name, undefined in (("nees_position", [1, 2, 4, 5]), ("nees_pose", [1, 2, 3, 4, 5])):
+        assert np.flatnonzero(np.isnan(found[name])).tolist() == undefined
+        others = np.setdiff1d(np.arange(len(cov)), [1, 2, 3, 4, 5])
+        np.testing.assert_allclose(found[name][others], metrics[name][others], rtol=1e-9)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -162,6 +163,16 @@ def test_reads_seeds_that_all_cells_have(whole, tmp_path, tiny, monkeypatch):
     (tmp_path / "runs" / cell.identifier / "seeds_00000-00002.nc").unlink()
     with pytest.raises(ValueError, match="no seed in common; run `vcjax reproduce` again"):
         load_results(tmp_path)
+
+
+def test_leftovers_are_removed_beside_finished_blocks_and_nothing_else_is(whole, tmp_path, tiny):
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
+    cell = tmp_path / "runs" / some_cells()[0].identifier
+    leftover, other = cell / ".seeds_00000-00002.nc.x1y2.tmp", cell / ".notes.txt.tmp"
+    for path in (leftover, other):
+        path.write_bytes(b"half a file")
+    reproduce(tmp_path, num_seeds=NUM_SEEDS, tables=(2,))
+    assert not tiny and not leftover.exists() and other.exists()
 
 
 @pytest.mark.parametrize("tables", [(2,), (3,)])

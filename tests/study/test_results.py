@@ -6,6 +6,7 @@ import json
 import random
 import shutil
 from functools import cache
+from importlib.metadata import PackageNotFoundError
 
 import jax
 import numpy as np
@@ -174,6 +175,15 @@ def test_attributes_tell_settings_apart():
     ]
     assert all(other != of() for other in others)
     assert of()["dtype"] == "float64"
+
+
+def test_source_tree_that_is_not_installed_has_an_unknown_version(monkeypatch):
+    def version(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(results, "version", version)
+    found = attributes(Experiment(tiny_runs.scenario(), tiny_runs.config()), jax.random.key(0))
+    assert found["vcjax"] == "unknown"
 
 
 def test_missing_xarray_is_told(monkeypatch, tmp_path):

@@ -1,7 +1,9 @@
 """Files that are complete or not there."""
 
+import errno
 import os
 import stat
+import tempfile
 
 import pytest
 
@@ -88,6 +90,18 @@ def test_writable_places_are_found_so_without_a_trace(tmp_path):
     assert path.read_bytes() == b"old" and names(tmp_path) == ["note.txt"]
     with pytest.raises(IsADirectoryError, match="is a directory; give the name of a file"):
         check_writable(tmp_path)
+
+
+@pytest.mark.parametrize("refuse", [check_writable, lambda place: write_file(place, b"")])
+def test_refusal_of_the_system_names_the_place_that_was_asked_for(tmp_path, monkeypatch, refuse):
+    def refuse_temporary(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "tmp0x1y2"))
+
+    monkeypatch.setattr(tempfile, "mkstemp", refuse_temporary)
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse_temporary)
+    with pytest.raises(PermissionError, match=r"Permission denied: '.*/note.txt'") as refusal:
+        refuse(tmp_path / "note.txt")
+    assert "tmp0x1y2" not in str(refusal.value)
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="the superuser may write everywhere")

@@ -79,6 +79,40 @@ def test_nan_in_a_run_that_counts_is_passed_on():
     assert np.isnan(summarise(runs).position_rmse_cm).all()
 
 
+def test_figure_that_a_run_does_not_have_is_left_out_of_the_mean():
+    """Frames without a defined NEES, runs without any or without an update: the others speak."""
+    runs, expected = fake_runs(num_seeds=4), fake_runs(num_seeds=4)
+    runs.nees_position[0], runs.nees_pose[0] = np.nan, np.nan
+    runs.nees_position[1, :5] = np.nan
+    runs.num_updates[2] = 0
+    summary, figures = summarise(runs), per_run(runs)
+    assert figures.anees_position[1] == pytest.approx(expected.nees_position[1, 5:].mean().item() / 2, rel=1e-12)
+    for name, missing in (("anees_position", 0), ("anees_pose", 0), ("nis", 2)):
+        others = np.delete(figures[name].values, missing)
+        assert np.isnan(figures[name][missing])
+        np.testing.assert_allclose(summary[name], [np.mean(others), stats.sem(others)], rtol=1e-12)
+    np.testing.assert_allclose(summary.anees_pose_bounds, stats.chi2.ppf([0.025, 0.975], 9) / 9, rtol=1e-12)
+    xr.testing.assert_identical(summary.position_rmse_cm, summarise(expected).position_rmse_cm)
+    difference = paired_difference(runs, expected)
+    np.testing.assert_array_equal(difference.anees_pose.values, 0)  # the three that both have are the same
+
+
+def test_figure_that_no_run_has_is_a_dash():
+    runs = fake_runs(num_seeds=3)
+    summary = summarise(runs.assign(nees_position=runs.nees_position * np.nan))
+    assert np.isnan(summary.anees_position).all() and np.isnan(summary.anees_position_bounds).all()
+    line = next(line for line in str(summary).splitlines() if line.startswith("ANEES position"))
+    assert line.split("  ")[-1].strip() == "–"
+
+
+def test_summary_prints_as_text_and_its_parts_as_data():
+    summary = summarise(tiny_runs())
+    assert str(summary) == summary_text(summary) and f"{summary}".startswith("position RMSE, cm        4.27")
+    assert isinstance(summary, xr.Dataset)
+    for part in (summary[["nis"]], summary.sel(statistic="mean")):
+        assert "Data variables" in str(part)
+
+
 def test_one_seed_has_a_mean_and_no_error():
     runs = fake_runs(num_seeds=1)
     summary = summarise(runs)

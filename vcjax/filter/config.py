@@ -9,7 +9,7 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 
-from vcjax.fields import number, require, require_count
+from vcjax.fields import number, require, require_choice, require_count, require_key, require_kind
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.virtual_correction import VirtualCorrection
@@ -69,6 +69,10 @@ class FilterConfig(eqx.Module):
     """Distance from every image border a new feature must keep, px; at least 0."""
 
     def __check_init__(self):
+        gates = "give a gate, e.g. VirtualCorrection() or ReprojectionError()."
+        require_kind("FilterConfig", "gate", self.gate, AbstractGate, gates)
+        detectors = "give a detector, e.g. InlierRatio(), or InlierRatio(min_searches=inf) to delete nothing."
+        require_kind("FilterConfig", "detector", self.detector, AbstractDetector, detectors)
         for name in ("pixel_std_px", "inverse_depth_mean", "inverse_depth_std", "inverse_depth_min"):
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
         for name in ("oscillation_std_m", "linearity_max", "birth_margin_px"):
@@ -81,11 +85,22 @@ class FilterConfig(eqx.Module):
             ("update", ("sequential", "stacked")),
             ("choose_among", ("predicted", "measured")),
             ("birth_order", ("lowest_id", "random")),
+            *((name, (True, False)) for name in ("retire", "skip_free_slots", "reverse_mode", "toolbox_parity")),
         ):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"FilterConfig({name}={getattr(self, name)!r}): choose one of {choices}.")
+            require_choice(self, name, choices)
         if self.max_updates > self.max_landmarks:
             raise ValueError(
                 f"FilterConfig(max_updates={self.max_updates}) exceeds max_landmarks={self.max_landmarks}: "
                 "no more landmarks can be corrected than the map holds; raise max_landmarks."
             )
+
+
+def check_arguments(function: str, config: object, key: object) -> None:
+    """Refuse what is no configuration, or no random key, before a function starts to work with it.
+
+    Raises:
+        ValueError: naming function, argument, what was given and remedy.
+    """
+    require_kind(function, "config", config, FilterConfig, "give a FilterConfig, e.g. vcjax.FilterConfig().")
+    if key is not None:
+        require_key(function, key)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from vcjax.filter import landmark_map
-from vcjax.filter.config import FilterConfig
+from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import choose, match, predict_features
 from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state, slot_count
@@ -158,6 +158,7 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
     Raises:
         ValueError: for a recording that no filter can run on (see `recording.validate`).
     """
+    check_arguments("start", config, key)
     validate(recording)
     state = initial_state(config, recording, key)
     frame = recording.frame(0)
@@ -222,6 +223,7 @@ def run(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = N
     Raises:
         ValueError: for a recording that no filter can run on (see `recording.validate`), before anything compiles.
     """
+    check_arguments("run", config, key)
     validate(recording)
     return _run(config, recording, key)
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 Prior = Literal["corrected", "predicted"]
+PRIORS = ("corrected", "predicted")
 
 
 class MeasurementModel(NamedTuple):
@@ -93,7 +94,10 @@ class AbstractGate(eqx.Module):
 
     @abstractmethod
     def judge(self, candidates: Candidates, model: MeasurementModel) -> Verdict:
-        """The verdict on each isolated candidate; false and NaN elsewhere."""
+        """The verdict on each isolated candidate; false and NaN elsewhere.
+
+        A candidate of which nothing can be said, its errors being NaN, is neither recovered nor dynamic.
+        """
 
 
 class Evidence(eqx.Module):

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vcjax.fields import number, require
-from vcjax.gates.gate import AbstractGate, Candidates, MeasurementModel, Prior, Verdict
+from vcjax.fields import number, require, require_choice
+from vcjax.gates.gate import PRIORS, AbstractGate, Candidates, MeasurementModel, Prior, Verdict
 
 
 class ReprojectionError(AbstractGate):
@@ -22,7 +22,7 @@ class ReprojectionError(AbstractGate):
 
     def __check_init__(self):
         require(self, "th1", lambda th: th > 0, "a threshold on a squared distance is positive (9.0 is 98.9 %).")
-        check_prior(self)
+        require_choice(self, "prior", PRIORS)
 
     def accepts(self, re1: Float[Array, "..."]) -> Bool[Array, "..."]:
         """RE₁ < Th₁."""
@@ -34,9 +34,3 @@ class ReprojectionError(AbstractGate):
         nobody = jnp.zeros_like(candidates.is_isolated)
         nothing = jnp.full(nobody.shape, np.nan, candidates.P.dtype)
         return Verdict(is_recovered=nobody, is_dynamic=nobody, re1=nothing, re2=nothing)
-
-
-def check_prior(gate: AbstractGate) -> None:
-    """Refuse an unknown prior."""
-    if gate.prior not in ("corrected", "predicted"):
-        raise ValueError(f"{type(gate).__name__}(prior={gate.prior!r}): choose 'corrected' or 'predicted'.")

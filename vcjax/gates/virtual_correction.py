@@ -22,9 +22,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from vcjax.ekf import correct, innovation_cov, mahalanobis
-from vcjax.fields import number, require
-from vcjax.gates.gate import AbstractGate, Candidates, MeasurementModel, Prior, Verdict, harmless
-from vcjax.gates.reprojection import check_prior
+from vcjax.fields import number, require, require_choice
+from vcjax.gates.gate import PRIORS, AbstractGate, Candidates, MeasurementModel, Prior, Verdict, harmless
 
 
 class VirtualCorrection(AbstractGate):
@@ -43,7 +42,7 @@ class VirtualCorrection(AbstractGate):
     def __check_init__(self):
         require(self, "th1", lambda th: th > 0, "a threshold on a squared distance is positive (9.0 is 98.9 %).")
         require(self, "th2", lambda th: th >= 0, "a threshold on a fall of squared distance is at least 0.")
-        check_prior(self)
+        require_choice(self, "prior", PRIORS)
 
     def accepts(self, re1: Float[Array, "..."]) -> Bool[Array, "..."]:
         """RE₁ < Th₁."""
@@ -57,10 +56,10 @@ class VirtualCorrection(AbstractGate):
 
         is_isolated, candidates = candidates.is_isolated, harmless(candidates)
         re1, re2 = jax.vmap(errors)(candidates.mean, candidates.P, candidates.uv_px)
-        is_dynamic = is_isolated & (re1 - re2 > self.th2)
+        fall = re1 - re2  # NaN, of which nothing can be said, is neither recovered nor dynamic
         return Verdict(
-            is_recovered=is_isolated & ~is_dynamic,
-            is_dynamic=is_dynamic,
+            is_recovered=is_isolated & (fall <= self.th2),
+            is_dynamic=is_isolated & (fall > self.th2),
             re1=jnp.where(is_isolated, re1, np.nan),
             re2=jnp.where(is_isolated, re2, np.nan),
         )

@@ -30,9 +30,10 @@ class Camera(eqx.Module):
 
     def __check_init__(self):
         require(self, "intrinsics_px", np.isfinite, "give finite u0 v0 au av in pixels.", length=4)
-        require(self, "intrinsics_px", lambda k: k[..., 2:] > 0, "focal lengths au av (the last two) must be positive.")
+        positive = "focal lengths au av (the last two) must be positive."
+        require(self, "intrinsics_px", lambda k: k[..., 2:] > 0, positive, length=4)
         require(self, "image_size_px", lambda size: size > 0, "give a positive width and height in pixels.", length=2)
-        require(self, "distortion", np.isfinite, "give finite coefficients, or none.")
+        require(self, "distortion", np.isfinite, "give finite coefficients, or none.", length=None)
 
 
 def distort(camera: Camera, point: Float[Array, "2"]) -> Float[Array, "2"]:

@@ -30,7 +30,7 @@ REPORTED = (
 _INTRODUCTION = """\
 # Tables 2–5 beside the paper
 
-{seeds} runs per cell. Each figure is the mean over runs ± its standard error, followed by the paper's own number in
+{seeds} {runs} per cell. Each figure is the mean over runs ± its standard error, followed by the paper's own number in
 brackets where it has one; RE with the oscillating camera is not in the paper. Counts are events per run, except
 *movers found* and *static deleted*, which count distinct features. ANEES is 1 for a consistent filter; the brackets
 beside it hold the 95 % interval of χ² with 2 degrees of freedom per run (the frames of a run are correlated and add
@@ -137,7 +137,7 @@ def _with_nulls(value: Any) -> Any:
 
 
 def _as_markdown(report: _Report) -> str:
-    sections = [_INTRODUCTION.format(seeds=report.seeds)]
+    sections = [_INTRODUCTION.format(seeds=report.seeds, runs="run" if report.seeds == 1 else "runs")]
     for table in sorted({cell.table for cell in report.summaries}):
         title = "static scene" if table == 2 else f"movers at {SPEEDS_M_S[table]:g} m/s, robot forward"
         motion = "Robot motion" if table == 2 else "Mover motion"
@@ -166,8 +166,9 @@ def _cell_rows(table: int, report: _Report) -> list[list[str]]:
                 format_mean(name, *_values(summary, name)) + (f" ({_printed(paper[name])})" if name in paper else "")
                 for name in REPORTED
             ]
-            bounds = "[{:.2f}, {:.2f}]".format(*_values(summary, "anees_position_bounds"))
-            anees = f"{format_mean('anees_position', *_values(summary, 'anees_position'))} {bounds}"
+            anees = format_mean("anees_position", *_values(summary, "anees_position"))
+            if math.isfinite(summary.anees_position_bounds[0]):
+                anees += " [{:.2f}, {:.2f}]".format(*_values(summary, "anees_position_bounds"))
             rows.append([cell.case, cell.method, *figures, anees, runs_text(summary)])
     return rows
 

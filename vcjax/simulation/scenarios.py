@@ -7,17 +7,26 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from vcjax.fields import is_concrete, number, require, require_count, vector
+from vcjax.fields import is_concrete, number, require, require_count, require_kind, vector
 from vcjax.models.camera import Camera
 from vcjax.models.motion import Oscillation
-from vcjax.simulation.world import Movers, grid
+from vcjax.simulation.world import Movers, features_at, features_drawn, grid, is_feature
 
 RobotMotion = Literal["forward", "curved", "lateral"]
 DynamicMotion = Literal["lateral", "inverse_forward"]
 DynamicSet = Literal["ahead", "near_path"]
+Triple = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
+
+MOUNT: Six = (0.0, 0.0, 0.6, -90.0, 0.0, -90.0)
+# Noise of the odometry per frame: x, y, z (m), rotation about x, y, z (deg).
+ODOMETRY_STD: dict[str, Six] = {
+    "planar": (0.005, 0.005, 0.0, 0.0, 0.0, 0.05),
+    "six_axis": (0.005, 0.005, 0.005, 0.05, 0.05, 0.05),
+}
 
 # DESIGN of the paper's world: three grid columns × both layers ahead of the robot, and a harder set beside its path.
-DYNAMIC_POINTS_M = {
+DYNAMIC_PLACES_M = {
     "ahead": [(4.0, y, z) for y in (-2.0, 0.0, 2.0) for z in (0.0, 1.0)],
     "near_path": [(x, y, 0.0) for x in (0.0, 4.0, 8.0) for y in (-2.0, 2.0)],
 }
@@ -33,7 +42,7 @@ ROBOT_MOTIONS = {
 class Scenario(eqx.Module):
     """A simulated experiment: robot, camera, oscillation, features, movers and noise."""
 
-    landmarks_m: Float[Array | np.ndarray, "F 3"]
+    landmarks_m: Float[Array | np.ndarray, "F 3"] = eqx.field(converter=vector)
     """Features at time 0, m. A feature's number is its track id."""
     movers: Movers
     """Which of them move, and how."""
@@ -45,9 +54,9 @@ class Scenario(eqx.Module):
     """Robot's x, y (m) and yaw (deg) before the first frame; its height is 0."""
     increment: tuple[float, float, float] = eqx.field(converter=vector, default=(0.05, 0.0, 0.0))
     """True motion per frame in the robot frame: x, y (m) and yaw (deg)."""
-    mount: tuple[float, ...] = eqx.field(converter=vector, default=(0.0, 0.0, 0.6, -90.0, 0.0, -90.0))
+    mount: tuple[float, ...] = eqx.field(converter=vector, default=MOUNT)
     """Camera in the robot frame: x, y, z (m), roll, pitch, yaw (deg)."""
-    odometry_std: tuple[float, ...] = eqx.field(converter=vector, default=(0.005, 0.005, 0.0, 0.0, 0.0, 0.05))
+    odometry_std: tuple[float, ...] = eqx.field(converter=vector, default=ODOMETRY_STD["planar"])
     """Noise of the odometry per frame: x, y, z (m), rotation about x, y, z (deg). Default: planar, Table 1."""
     pixel_std_px: float = eqx.field(converter=number, default=1.0)
     """Noise of a measured pixel, px."""
@@ -57,10 +66,12 @@ class Scenario(eqx.Module):
     """Frames in a run."""
 
     def __check_init__(self):
+        for name, kind in (("movers", Movers), ("oscillation", Oscillation), ("camera", Camera)):
+            require_kind("Scenario", name, getattr(self, name), kind, f"give an object of the class {kind.__name__}.")
         shape = np.shape(self.landmarks_m)
         if len(shape) < 2 or shape[-1] != 3 or shape[-2] == 0:
             raise ValueError(f"Scenario(landmarks_m) has shape {shape}; give at least one feature, (F, 3) m.")
-        require(self, "landmarks_m", np.isfinite, "features need finite places.")
+        require(self, "landmarks_m", np.isfinite, "features need finite places.", length=None)
         for name, length in (("start", 3), ("increment", 3), ("mount", 6)):
             require(self, name, np.isfinite, "give finite numbers.", length)
         require(self, "odometry_std", lambda s: np.isfinite(s) & (s >= 0), "standard deviations are at least 0.", 6)
@@ -75,8 +86,9 @@ class Scenario(eqx.Module):
         rate, frequency = self.frame_rate_hz, self.oscillation.frequency_hz
         if is_concrete(rate) and is_concrete(frequency) and np.any(np.asarray(frequency) >= np.asarray(rate) / 2):
             raise ValueError(
-                f"Scenario(oscillation.frequency_hz={np.asarray(frequency).tolist()}) is at or above "
-                f"half the frame rate ({np.asarray(rate).tolist()} Hz); choose a lower frequency or a higher rate."
+                f"Scenario(oscillation.frequency_hz={np.asarray(frequency).tolist()}) is not below half the frame rate "
+                f"of {np.asarray(rate).tolist()} Hz; choose a lower frequency (a steady camera may have 0) "
+                "or a higher rate."
             )
 
 
@@ -92,8 +104,24 @@ def paper(
     pixel_error_std_px: float = 1.0,
     frame_rate_hz: float = 10.0,
     num_frames: int = 160,
+    *,
+    start: Triple | None = None,
+    increment: Triple | None = None,
+    odometry_std: Six | None = None,
+    mount: Six = MOUNT,
+    intrinsics_px: tuple[float, float, float, float] = (320.0, 240.0, 320.0, 320.0),
+    image_size_px: tuple[float, float] = (640.0, 480.0),
+    distortion: Sequence[float] = (),
+    dynamic_direction: Triple | None = None,
+    dynamic_places_m: Sequence[Triple] = (),
+    dynamic_drawn: int | None = None,
+    dynamic_seed: int = 0,
+    grid_low_m: float = -8.0,
+    grid_high_m: float = 8.0,
+    grid_per_side: int = 9,
+    grid_heights_m: Sequence[float] = (0.0, 1.0),
 ) -> Scenario:
-    """One of the paper's experiments (section 4, Table 1).
+    """One of the paper's experiments (section 4, Table 1), or one like them.
 
     Args:
         robot: forward along x from (-8, 0); curved by 0.5° per frame from (-8, -8); or lateral along y, looking
@@ -108,9 +136,24 @@ def paper(
         pixel_error_std_px: noise of a measured pixel, px (the filter assumes its own).
         frame_rate_hz: frames per second.
         num_frames: frames in a run.
+        start: where the robot starts instead: x, y (m) and yaw (deg).
+        increment: the robot's motion per frame instead of its step: x, y (m) and yaw (deg) in its own frame.
+        odometry_std: noise of the odometry per frame instead: x, y, z (m), rotation about x, y, z (deg).
+        mount: camera in the robot frame: x, y, z (m), roll, pitch, yaw (deg).
+        intrinsics_px: the camera's principal point u0, v0 and focal lengths αu, αv, px.
+        image_size_px: its width and height, px.
+        distortion: its radial distortion coefficients d1, d2, …; none by default.
+        dynamic_direction: direction of the dynamic features instead of a named motion; its length means nothing.
+        dynamic_places_m: the dynamic features by their places x, y, z (m) instead of a set.
+        dynamic_drawn: how many dynamic features to draw among all features, instead of a set.
+        dynamic_seed: seed of that draw, and of nothing else.
+        grid_low_m: lowest x and y of the square grid of features, m.
+        grid_high_m: highest x and y, m.
+        grid_per_side: features along each side.
+        grid_heights_m: height of each layer of the grid, m.
 
     Raises:
-        ValueError: for an unknown name, or a number out of its range.
+        ValueError: for an unknown name, a number out of its range, or options that contradict each other.
     """
     for name, value, choices in (
         ("robot", robot, tuple(ROBOT_MOTIONS)),
@@ -119,37 +162,52 @@ def paper(
     ):
         if value not in choices:
             raise ValueError(f"paper({name}={value!r}): choose one of {choices}.")
-    landmarks = grid()
-    start, direction = ROBOT_MOTIONS[robot]
-    odometry_std = (0.005,) * 3 + (0.05,) * 3 if noise == "six_axis" else (0.005, 0.005, 0.0, 0.0, 0.0, 0.05)
+    if dynamic is not None and dynamic_direction is not None:
+        raise ValueError(f"paper(dynamic={dynamic!r}, dynamic_direction={dynamic_direction}): give one of the two.")
+    is_static = dynamic is None and dynamic_direction is None
+    landmarks = grid(grid_low_m, grid_high_m, grid_per_side, grid_heights_m)
+    place, (x, y, yaw_deg) = ROBOT_MOTIONS[robot]
     return Scenario(
         landmarks_m=landmarks,
         movers=Movers(
-            ids=_dynamic_ids(dynamic_set, landmarks),
-            direction=DIRECTIONS[dynamic or "lateral"],
-            speed_m_s=dynamic_speed_m_s if dynamic else 0.0,
+            ids=_dynamic_ids(landmarks, dynamic_set, dynamic_places_m, dynamic_drawn, dynamic_seed, is_static),
+            direction=DIRECTIONS[dynamic or "lateral"] if dynamic_direction is None else dynamic_direction,
+            speed_m_s=0.0 if is_static else dynamic_speed_m_s,
         ),
         oscillation=Oscillation(oscillation_amplitude_m, oscillation_frequency_hz),
-        start=start,
-        increment=(step_m * direction[0], step_m * direction[1], direction[2]),
-        odometry_std=odometry_std,
+        camera=Camera(intrinsics_px, image_size_px, tuple(distortion)),
+        start=place if start is None else start,
+        increment=(step_m * x, step_m * y, yaw_deg) if increment is None else increment,
+        mount=mount,
+        odometry_std=ODOMETRY_STD[noise] if odometry_std is None else odometry_std,
         pixel_std_px=pixel_error_std_px,
         frame_rate_hz=frame_rate_hz,
         num_frames=num_frames,
     )
 
 
-def _dynamic_ids(dynamic_set: DynamicSet | Sequence[int], landmarks: Float[np.ndarray, "F 3"]) -> np.ndarray:
-    """Feature ids of a preset, or the ids given."""
+def _dynamic_ids(
+    landmarks: Float[np.ndarray, "F 3"],
+    dynamic_set: DynamicSet | Sequence[int],
+    places_m: Sequence[Triple],
+    num_drawn: int | None,
+    seed: int,
+    is_static: bool,
+) -> Sequence[int] | np.ndarray:
+    """Feature ids of a preset, of places or of a draw, or the ids given."""
+    is_default = isinstance(dynamic_set, str) and dynamic_set == "ahead"
+    if (not is_default) + (len(places_m) > 0) + (num_drawn is not None) > 1:
+        raise ValueError("paper: give one of dynamic_set, dynamic_places_m and dynamic_drawn.")
+    if num_drawn is not None:
+        return features_drawn(len(landmarks), num_drawn, seed)
+    if len(places_m):
+        return features_at(landmarks, places_m)
     if not isinstance(dynamic_set, str):
-        ids = np.asarray(dynamic_set)
-        if ids.size and not np.issubdtype(ids.dtype, np.integer):
-            raise ValueError(f"paper(dynamic_set={dynamic_set!r}): feature ids are whole numbers.")
-        return ids.astype(np.int32)
-    if dynamic_set not in DYNAMIC_POINTS_M:
+        return dynamic_set
+    if dynamic_set not in DYNAMIC_PLACES_M:
         raise ValueError(
-            f"paper(dynamic_set={dynamic_set!r}): choose one of {tuple(DYNAMIC_POINTS_M)}, or give feature ids."
+            f"paper(dynamic_set={dynamic_set!r}): choose one of {tuple(DYNAMIC_PLACES_M)}, or give feature ids."
         )
-    points = np.array(DYNAMIC_POINTS_M[dynamic_set])
-    distance = np.linalg.norm(landmarks[:, None] - points, axis=-1)
-    return np.sort(np.argmin(distance, axis=0)).astype(np.int32)
+    preset = np.array(DYNAMIC_PLACES_M[dynamic_set])
+    # Where nothing moves, the grid may lack the preset's places.
+    return np.sort(features_at(landmarks, preset[is_feature(landmarks, preset)] if is_static else preset))

@@ -1,5 +1,7 @@
 """One run against its truth: trajectory errors, consistency, and what was detected. Computed inside the batch."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -41,7 +43,8 @@ def trajectory_errors(info: FrameInfo, truth: Truth) -> dict[str, Float[Array, "
 
     `position_error_m` is √(ex² + ey²); `orientation_error_deg` the angle between the true and the estimated
     orientation; `yaw_error_deg` the absolute error of the yaw angle. `nees_position` = eᵀ P⁻¹ e of (x, y), 2 degrees
-    of freedom, and `nees_pose` of (x, y, yaw), 3: in a consistent filter their means are 2 and 3.
+    of freedom, and `nees_pose` of (x, y, yaw), 3: in a consistent filter their means are 2 and 3. They are NaN where
+    P is singular up to rounding, as without odometry noise: there the error has no size that it could be compared to.
     """
     robot, cov = info.vehicle[:, :7], info.vehicle_cov[:, :7, :7]
     error_xy = robot[:, :2] - truth.robot[:, :2]
@@ -55,14 +58,31 @@ def trajectory_errors(info: FrameInfo, truth: Truth) -> dict[str, Float[Array, "
     G = G.at[:, 0, 0].set(1.0).at[:, 1, 1].set(1.0).at[:, 2, 3:].set(yaw_H)
     pose_cov = G @ cov @ G.mT
     error_pose = jnp.concatenate([error_xy, error_yaw[:, None]], axis=1)
-    solved = jnp.linalg.solve(pose_cov, error_pose[..., None])[..., 0]
     return {
         "position_error_m": jnp.sqrt(jnp.sum(error_xy**2, axis=1)),
         "orientation_error_deg": jnp.rad2deg(2.0 * jnp.arctan2(sine, jnp.abs(relative[:, 0]))),
         "yaw_error_deg": jnp.rad2deg(jnp.abs(error_yaw)),
-        "nees_position": jax.vmap(mahalanobis)(error_xy, cov[:, :2, :2]),
-        "nees_pose": jnp.sum(error_pose * solved, axis=1),
+        "nees_position": _where_defined(jax.vmap(mahalanobis), error_xy, cov[:, :2, :2]),
+        "nees_pose": _where_defined(_normalised_square, error_pose, pose_cov),
     }
+
+
+def _normalised_square(error: Float[Array, "T n"], cov: Float[Array, "T n n"]) -> Float[Array, " T"]:
+    """eᵀ P⁻¹ e of each frame."""
+    return jnp.sum(error * jnp.linalg.solve(cov, error[..., None])[..., 0], axis=1)
+
+
+def _where_defined(square: Callable, error: Float[Array, "T n"], cov: Float[Array, "T n n"]) -> Float[Array, " T"]:
+    """A normalised square where the covariance has an inverse: its correlations' determinant is not rounding (100 ε).
+
+    NaN elsewhere.
+    """
+    variances = jnp.diagonal(cov, axis1=1, axis2=2)
+    scale = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    correlations = cov / (scale[:, :, None] * scale[:, None, :])
+    is_defined = jnp.linalg.det(correlations) > 100 * jnp.finfo(cov.dtype).eps
+    harmless = jnp.where(is_defined[:, None, None], cov, jnp.eye(cov.shape[-1], dtype=cov.dtype))
+    return jnp.where(is_defined, square(error, harmless), jnp.nan)
 
 
 def _wrap(angle: Float[Array, " T"]) -> Float[Array, " T"]:

@@ -17,7 +17,8 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, PRNGKeyArray
 
-from vcjax.filter.config import FilterConfig
+from vcjax.fields import require_key, require_kind
+from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.slam import run
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import simulate
@@ -60,13 +61,14 @@ def monte_carlo(
         xarray.Dataset with dimensions (*sweep paths, seed, frame or feature); see `results.as_dataset`.
 
     Raises:
-        ValueError: for a bad number of seeds, key or list of devices, unknown sweep paths or values out of range,
-            before anything compiles.
+        ValueError: for a scenario, configuration or key that is none, a bad number of seeds or list of devices,
+            unknown sweep paths or values out of range, before anything compiles.
         ModuleNotFoundError: if xarray is not installed.
     """
     import_xarray()  # where it is missing, say so now and not after the work
-    _check_arguments(num_seeds, first_seed, key, devices)
-    experiment = Experiment(scenario, FilterConfig() if config is None else config)
+    config = FilterConfig() if config is None else config
+    _check_arguments(scenario, config, num_seeds, first_seed, key, devices)
+    experiment = Experiment(scenario, config)
     values = check_sweep(experiment, sweep or {})
     seeds = np.arange(first_seed, first_seed + num_seeds)
     axes = np.meshgrid(*values.values(), seeds, indexing="ij")
@@ -77,18 +79,15 @@ def monte_carlo(
     return as_dataset(lanes, experiment, values, seeds, key)
 
 
-def _check_arguments(num_seeds: int, first_seed: int, key: PRNGKeyArray, devices: Sequence | None) -> None:
+def _check_arguments(scenario, config, num_seeds: int, first_seed: int, key, devices: Sequence | None) -> None:
     """Refuse what `monte_carlo` cannot run, naming argument, value and remedy."""
+    require_kind("monte_carlo", "scenario", scenario, Scenario, "give a Scenario, e.g. vcjax.scenarios.paper().")
+    check_arguments("monte_carlo", config, key)
+    require_key("monte_carlo", key)
     if not isinstance(num_seeds, Integral) or num_seeds < 1:
         raise ValueError(f"monte_carlo(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
     if not isinstance(first_seed, Integral) or not 0 <= first_seed <= 2**32 - num_seeds:
         raise ValueError(f"monte_carlo(first_seed={first_seed!r}): seeds are whole numbers from 0 to 2**32 - 1.")
-    is_key = isinstance(key, jax.Array) and (
-        key.shape == () if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) else key.shape == (2,)
-    )
-    if not is_key:
-        found = f"{key.dtype}{list(key.shape)}" if isinstance(key, jax.Array) else repr(key)
-        raise ValueError(f"monte_carlo(key={found}): give one random key, e.g. jax.random.key(0).")
     if devices is not None and len(devices) == 0:
         raise ValueError("monte_carlo(devices=[]): give at least one device, or None for all.")
 

@@ -23,7 +23,7 @@ from vcjax.simulation.scenarios import paper
 from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.paper import TABLES, Cell, cells
 from vcjax.study.results import attributes, load, load_attributes, save
-from vcjax.study.storage import write_file
+from vcjax.study.storage import remove_leftovers, write_file
 from vcjax.study.sweep import Experiment
 
 SEEDS_PER_BLOCK = 25
@@ -79,6 +79,8 @@ def reproduce(
     for cell in cells():
         for _, _, path in _blocks(directory / "runs" / cell.identifier):
             _refuse_other_settings(path, cell_experiment(cell), key)
+    for cell in cells():
+        remove_leftovers(directory / "runs" / cell.identifier, "seeds_*.nc")
     write_file(directory / "README.txt", _README.encode())  # also tells at once whether the place can be written
     blocks = [(first, min(first + SEEDS_PER_BLOCK, num_seeds)) for first in range(0, num_seeds, SEEDS_PER_BLOCK)]
     # Gate by gate, since each compiles once; the paper's order within.

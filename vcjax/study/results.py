@@ -8,7 +8,7 @@ import dataclasses
 import json
 import os
 from collections.abc import Callable
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -108,8 +108,16 @@ def attributes(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Any]:
         "config": json.dumps(describe(experiment.config)),
         "key": json.dumps(np.asarray(jax.random.key_data(key)).tolist()),
         "dtype": str(jax.dtypes.canonicalize_dtype(np.float64)),
-        "vcjax": version("vcjax"),
+        "vcjax": _version(),
     }
+
+
+def _version() -> str:
+    """The version of this package; "unknown" where it runs from a source tree and is not installed."""
+    try:
+        return version("vcjax")
+    except PackageNotFoundError:
+        return "unknown"
 
 
 def describe(tree: Any) -> Any:

@@ -23,9 +23,9 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
         raise NotADirectoryError(f"{path.parent} is a file; give a place in a directory.") from None
-    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
-        leftover.unlink(missing_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    remove_leftovers(path.parent, glob.escape(path.name))
+    with _naming(path):
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -36,6 +36,12 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path, names: str) -> None:
+    """Remove what processes that were killed while writing files of some names (a pattern) have left in a folder."""
+    for leftover in folder.glob(f".{names}.*.tmp"):
+        leftover.unlink(missing_ok=True)
 
 
 def write_file(path: str | os.PathLike, content: bytes) -> Path:
@@ -61,8 +67,17 @@ def check_writable(path: str | os.PathLike) -> None:
     folder = next(parent for parent in path.absolute().parents if parent.exists())
     if not folder.is_dir():
         raise NotADirectoryError(f"{folder} is a file; give a place in a directory.")
-    with tempfile.TemporaryFile(dir=folder):
+    with _naming(path), tempfile.TemporaryFile(dir=folder):
         pass
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Name the place that was asked for, and not that of a temporary file, in the error of the system."""
+    try:
+        yield
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from None
 
 
 def _umask() -> int:

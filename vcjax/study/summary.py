@@ -31,6 +31,9 @@ FIGURES = {
 DECIMALS = dict.fromkeys(FIGURES, 2) | {"orientation_error_deg": 4, "yaw_error_deg": 4}
 """Decimals shown of each figure: one more than a standard error over 25 runs warrants."""
 
+SOMETIMES_UNDEFINED = ("anees_position", "anees_pose", "nis")
+"""Figures that a run need not have (no covariance to speak of, no update): means are over the runs that have them."""
+
 _DOF = {"anees_position": 2, "anees_pose": 3}
 _CONFIDENCE = 0.95
 _SWEPT = (
@@ -44,13 +47,24 @@ _SWEPT = (
 )  # what fits on one line per point of a sweep
 
 
+class Summary(xr.Dataset):
+    """What `summarise` gives: a Dataset which, while whole, prints as `summary_text`."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        is_whole = {*FIGURES, "num_runs", "runs_failed", "runs_map_full"} <= set(self) and "statistic" in self.dims
+        return summary_text(self) if is_whole else repr(self)
+
+
 def per_run(runs: xr.Dataset) -> xr.Dataset:
     """Figures of each run: RMS errors over the frames, counts of events, and normalised consistency statistics.
 
     Errors are √(mean over frames of e²). A dynamic event is any deletion, by the gate's verdict or by the detector;
     `dynamic_found_per_run` and `static_deleted_per_run` count distinct moving and static features deleted at least
-    once. ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter. `nis` is the mean
-    squared Mahalanobis distance of the accepted updates / 2, NaN where there was none; the gate cuts its tail off, so a
+    once. ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter; frames where it is not
+    defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `nis` is the mean squared
+    Mahalanobis distance of the accepted updates / 2, NaN where there was none; the gate cuts its tail off, so a
     consistent filter has 1 − t·exp(−t) / (1 − exp(−t)) with t = Th₁ / 2, which is 0.95 for Th₁ = 9.
 
     Args:
@@ -74,64 +88,65 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
                 "inconsistent_deletions_per_run": inconsistent,
                 "dynamic_found_per_run": (was_deleted & runs.is_moving).sum("feature"),
                 "static_deleted_per_run": (was_deleted & ~runs.is_moving).sum("feature"),
-                "anees_position": runs.nees_position.mean("frame", skipna=False) / _DOF["anees_position"],
-                "anees_pose": runs.nees_pose.mean("frame", skipna=False) / _DOF["anees_pose"],
+                "anees_position": runs.nees_position.mean("frame", skipna=True) / _DOF["anees_position"],
+                "anees_pose": runs.nees_pose.mean("frame", skipna=True) / _DOF["anees_pose"],
                 "nis": runs.nis_sum.sum("frame", skipna=False) / num_updates.where(num_updates > 0) / 2,
             }
         )
     return figures.where(runs.is_finite).assign(is_finite=runs.is_finite)
 
 
-def mean_and_error(values: xr.DataArray, is_finite: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
-    """Mean over the finite seeds and its standard error s / √n, with n − 1 in the variance.
+def mean_and_error(values: xr.DataArray, counts: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
+    """Mean over the seeds that count and its standard error s / √n, with n − 1 in the variance.
 
     Args:
         values: (..., seed, ...).
-        is_finite: (..., seed), which runs count.
+        counts: (..., seed), which runs count.
 
     Returns:
         Mean and standard error without the dimension `seed`; NaN where no run (error: fewer than two runs) is left. A
         NaN of a run that counts is passed on, not skipped.
     """
-    num = is_finite.sum("seed")
-    mean = values.where(is_finite, 0.0).sum("seed", skipna=False) / num.where(num > 0)
-    deviation = (values - mean).where(is_finite, 0.0)
+    num = counts.sum("seed")
+    mean = values.where(counts, 0.0).sum("seed", skipna=False) / num.where(num > 0)
+    deviation = (values - mean).where(counts, 0.0)
     variance = (deviation**2).sum("seed", skipna=False) / (num - 1).where(num > 1)
     return mean, (variance / num) ** 0.5
 
 
-def summarise(runs: xr.Dataset) -> xr.Dataset:
+def summarise(runs: xr.Dataset) -> Summary:
     """Mean and standard error over the finite seeds of every figure of `per_run`, with bounds for ANEES.
 
-    The bounds are the two-sided 95 % interval of χ²(n·dof) / (n·dof) for n finite seeds: 2 dof for the position (x, y)
-    and 3 for the pose (x, y, yaw). The frames of a run are correlated, so they add nothing to the degrees of freedom:
-    the interval is that of one frame's average over seeds and therefore cautious for the mean over frames.
+    The bounds are the two-sided 95 % interval of χ²(n·dof) / (n·dof) for the n finite seeds that have an ANEES: 2 dof
+    for the position (x, y), 3 for the pose (x, y, yaw). The frames of a run are correlated, so they add nothing to the
+    degrees of freedom: the interval is that of one frame's average over seeds, cautious for the mean over frames.
 
     Args:
         runs: one cell's runs with dimensions (..., seed, frame, feature).
 
     Returns:
-        Every figure as (statistic, ...) with statistic "mean" and "se"; `anees_position_bounds` and
-        `anees_pose_bounds` as (bound, ...) with bound "lower" and "upper"; `num_runs`, `runs_failed` and
-        `runs_map_full` (runs in which the map was full in some frame) as counts.
+        A Dataset that prints as text: every figure as (statistic, ...) with statistic "mean" and "se";
+        `anees_position_bounds` and `anees_pose_bounds` as (bound, ...) with bound "lower" and "upper"; `num_runs`,
+        `runs_failed` and `runs_map_full` (runs in which the map was full in some frame) as counts.
 
     References:
         Bar-Shalom, Li, Kirubarajan 2001, *Estimation with Applications to Tracking and Navigation*, section 5.4.
     """
     figures = per_run(runs)
     is_finite = figures.is_finite
-    mean, error = mean_and_error(_as_array(figures), is_finite)
+    array = _as_array(figures)
+    mean, error = mean_and_error(array, _counts(array, is_finite))
     summary = _statistics({"mean": mean, "se": error})
-    num = is_finite.sum("seed")
     tails = {"lower": (1 - _CONFIDENCE) / 2, "upper": (1 + _CONFIDENCE) / 2}
     for name, dof in _DOF.items():
+        num = (is_finite & figures[name].notnull()).sum("seed")
         dof_total = dof * num.where(num > 0)
         bounds = {side: xr.apply_ufunc(stats.chi2.ppf, q, dof_total) / dof_total for side, q in tails.items()}
         summary[f"{name}_bounds"] = xr.concat(list(bounds.values()), xr.Variable("bound", list(bounds)))
     summary["num_runs"] = xr.ones_like(is_finite, dtype=int).sum("seed")
     summary["runs_failed"] = (~is_finite).sum("seed")
     summary["runs_map_full"] = (runs.map_full_frames > 0).sum("seed")
-    return summary
+    return Summary(summary.data_vars, summary.coords)
 
 
 def paired_difference(runs_a: xr.Dataset, runs_b: xr.Dataset) -> xr.Dataset:
@@ -159,8 +174,10 @@ def paired_difference(runs_a: xr.Dataset, runs_b: xr.Dataset) -> xr.Dataset:
     a, b = per_run(runs_a).sel(seed=seeds), per_run(runs_b).sel(seed=seeds)
     with xr.set_options(arithmetic_join="exact"):
         is_finite = a.is_finite & b.is_finite
-        mean, error = mean_and_error(_as_array(a) - _as_array(b), is_finite)
-    half_width = error * xr.apply_ufunc(student_t, is_finite.sum("seed"))
+        difference = _as_array(a) - _as_array(b)
+    counts = _counts(difference, is_finite)
+    mean, error = mean_and_error(difference, counts)
+    half_width = error * xr.apply_ufunc(student_t, counts.sum("seed"))
     statistics = {"mean": mean, "se": error, "lower": mean - half_width, "upper": mean + half_width}
     return _statistics(statistics).assign(num_pairs=is_finite.sum("seed"))
 
@@ -203,7 +220,7 @@ def runs_text(summary: xr.Dataset) -> str:
 
 def _figure_text(summary: xr.Dataset, name: str) -> str:
     text = format_mean(name, *summary[name].values)
-    if f"{name}_bounds" in summary:
+    if f"{name}_bounds" in summary and summary[f"{name}_bounds"].notnull().all():
         text += "  (95 % of consistent filters: {:.2f} to {:.2f})".format(*summary[f"{name}_bounds"].values)
     return text
 
@@ -219,6 +236,11 @@ def _rms(error: xr.DataArray) -> xr.DataArray:
 
 def _as_array(figures: xr.Dataset) -> xr.DataArray:
     return figures[list(FIGURES)].to_dataarray("figure")
+
+
+def _counts(figures: xr.DataArray, is_finite: xr.DataArray) -> xr.DataArray:
+    """Which runs count for each figure: the finite ones, where a figure need not be defined those that have it."""
+    return is_finite & (figures.notnull() | ~figures.figure.isin(SOMETIMES_UNDEFINED))
 
 
 def _statistics(statistics: dict[str, xr.DataArray]) -> xr.Dataset:

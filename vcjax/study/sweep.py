@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -45,8 +46,12 @@ def _replaced(field: Any, values: Mapping[str, Any]) -> Any:
     if dataclasses.is_dataclass(field):
         return replace_at(field, values)
     elements = [values.get(str(i), field[i]) for i in range(len(field))]
-    xnp = np if all(map(is_concrete, elements)) else jnp
-    return xnp.stack(xnp.broadcast_arrays(*elements), axis=-1)
+    if not all(map(is_concrete, elements)):
+        return jnp.stack(jnp.broadcast_arrays(*elements), axis=-1)
+    stacked = np.stack(np.broadcast_arrays(*elements), axis=-1)
+    return (
+        stacked if stacked.ndim == 1 else jax.device_put(stacked)
+    )  # several vectors are a batch, which JAX arrays are
 
 
 def numeric_paths(tree: Any) -> Iterator[str]:
@@ -83,7 +88,8 @@ def check_sweep(experiment: Experiment, sweep: Sweep) -> dict[str, np.ndarray]:
             raise ValueError(f"sweep[{path!r}] = {listed!r}: give a list of at least one number.")
     grid = [axis.ravel() for axis in np.meshgrid(*values.values(), indexing="ij")]
     try:
-        replace_at(experiment, dict(zip(values, grid, strict=True)))
+        # As a batch, which only JAX arrays are. In float32 some are rounded, and one by one they are looked at again.
+        replace_at(experiment, dict(zip(values, map(jax.device_put, grid), strict=True)))
         return values
     except ValueError:
         pass
