@@ -41,8 +41,8 @@ class FilterConfig(eqx.Module):
     retire: bool = eqx.field(static=True, default=True)
     """Free the slot of a landmark whose track has ended in the recording, as soon as nothing depends on it any more:
     at once if landmarks are chosen among the measured; among the predicted, where it may still use up a place for
-    update or be deleted by the detector, once it is predicted far outside the image. Exact for everything that
-    stays."""
+    update or be deleted by the detector, once it is predicted far outside the image (`features.NEAR_PX`). Exact for
+    everything that stays, unless a landmark would come back from there, as badly mapped ones rarely do."""
     blacklist_capacity: int = eqx.field(static=True, default=0)
     """How many deleted features are remembered and never born again; 0: a deleted feature may come back."""
     skip_free_slots: bool = eqx.field(static=True, default=True)

@@ -25,7 +25,7 @@ class Block(NamedTuple):
 
 
 NEAR_PX = 64.0
-"""How far outside the image a landmark may be predicted that soon may be predicted inside again."""
+"""How far outside the image a landmark may be predicted and still be expected back, px."""
 
 
 class Observation(NamedTuple):

@@ -118,8 +118,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     )
     detector, is_flagged = config.detector.observe(state.detector, evidence)
     is_flagged &= state.is_mapped & ~is_dynamic
-    has_ended = state.has_ended | (frame.is_last[column] & (column >= 0))
-    state = eqx.tree_at(lambda s: (s.detector, s.has_ended), state, (detector, has_ended))
+    state = eqx.tree_at(lambda s: s.detector, state, detector)
 
     info_of_candidates = dict(
         candidate_id=jnp.where(is_searched, state.track_id[slot], FREE),
@@ -139,6 +138,8 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     state = landmark_map.delete(landmark_map.ban(state, is_deleted), is_deleted)
     if config.retire:
         state = landmark_map.retire(config, state, prediction.is_near)
+    has_ended = state.has_ended | (frame.is_last[column] & (column >= 0))
+    state = eqx.tree_at(lambda s: s.has_ended, state, has_ended)
     num_features = frame.is_valid.shape[0]
     place = jnp.where(state.is_mapped & (column >= 0), column, num_features)
     is_mapped = jnp.zeros(num_features, bool).at[place].set(True, mode="drop")
