@@ -138,7 +138,7 @@ def test_core_needs_no_optional_package():
     told = run_alone(
         """
 import sys
-optional = ["xarray", "h5netcdf", "h5py", "matplotlib", "rich", "scipy.stats", "tyro"]
+optional = ["xarray", "netCDF4", "matplotlib", "rich", "scipy.stats", "tyro"]
 sys.modules.update(dict.fromkeys(optional))  # an attempt to import any of them fails
 import jax
 import vcjax

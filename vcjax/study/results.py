@@ -138,7 +138,7 @@ def save(dataset: Any, path: str | os.PathLike) -> Path:
     """
     compressed = {name: {"zlib": True, "complevel": 4} for name, variable in dataset.items() if variable.ndim}
     with replacing(path) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf", encoding=compressed)
+        dataset.to_netcdf(temporary, engine="netcdf4", encoding=compressed)
     return Path(path)
 
 
@@ -159,15 +159,10 @@ def load_attributes(path: str | os.PathLike) -> dict[str, Any]:
 
 def _read(path: str | os.PathLike, part: Callable[[Any], Any]) -> Any:
     xarray = import_xarray()
-    import h5py
-
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such results file.")
     try:
-        # By h5py first: where that fails, h5netcdf fails too, but leaves an object that complains when it goes.
-        with h5py.File(path) as file:
-            dict(file.attrs)
-        with xarray.open_dataset(path, engine="h5netcdf") as dataset:
+        with xarray.open_dataset(path, engine="netcdf4") as dataset:
             found, result = dataset.attrs.get("schema"), part(dataset)
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise ValueError(f"{path}: not a readable NetCDF-4 file ({error}); remove it and run again.") from error
