@@ -49,10 +49,11 @@ def main(results: tyro.conf.Positional[Path], picture: tyro.conf.Positional[Path
             cells = [Cell(table, "forward", "inverse_forward", v, *method) for table, v in SPEEDS_M_S.items()]
             mean, error = np.array([summarise(runs[cell])[name].values for cell in cells]).T
             x = np.arange(len(cells)) + 0.2 * (i - 1.5)
-            axes.bar(x, mean, 0.18, yerr=error, color=COLORS[method], label=cells[0].method, ecolor="#4d4d4d")
+            bars = axes.bar(x, mean, 0.18, yerr=error, color=COLORS[method], label=cells[0].method, ecolor="#4d4d4d")
+            axes.bar_label(bars, fmt="%.1f", fontsize=6, padding=1)  # a bar of height zero would not be seen
         axes.set_xticks(range(len(SPEEDS_M_S)), [f"{v:g} m/s" for v in SPEEDS_M_S.values()])
         axes.set_xlabel("their speed")
-    found.set(title="movers found, of six (± 1 s.e.)", ylim=(0, 6))
+    found.set(title="movers found, of six (± 1 s.e.)", ylim=(0, 6.4))
     position.set(title="position error, cm RMS (± 1 s.e.)")
     handles, labels = found.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
