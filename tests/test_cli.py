@@ -121,7 +121,7 @@ def test_reproduce_then_report(tmp_path, capsys, monkeypatch):
     whole = reproduce_module.cell_experiment
     monkeypatch.setattr(reproduce_module, "cells", lambda tables=(2, 3, 4, 5): cells(tables)[:4])
     monkeypatch.setattr(reproduce_module, "cell_experiment", lambda cell: tiny_runs.tiny_experiment(whole(cell)))
-    monkeypatch.setattr(monte_carlo_module, "MAX_LANES_PER_CALL", NUM_SEEDS)
+    monkeypatch.setattr(monte_carlo_module, "LANES_PER_CALL", NUM_SEEDS)
     out = tmp_path / "paper"
     assert main(["reproduce", "--seeds", "3", "--tables", "2", "--out", str(out)]) == 0
     _, told = said(capsys)

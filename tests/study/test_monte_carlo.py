@@ -78,8 +78,8 @@ def test_results_are_labelled():
 
 def test_seed_depends_on_its_number_only(monkeypatch):
     """Not on the calls it is divided into, nor on the first seed; and progress tells of each call."""
-    monkeypatch.setattr(module, "MAX_LANES_PER_CALL", NUM_SEEDS)
-    strict_runs()
+    monkeypatch.setattr(module, "LANES_PER_CALL", NUM_SEEDS)
+    run_strict()
     told = []
     with compilations() as compiled:
         five = run_strict(num_seeds=5, progress=lambda *done: told.append(done))
@@ -158,7 +158,8 @@ def test_failed_seed_is_flagged_counted_and_spoils_no_other(monkeypatch):
     monkeypatch.setattr(module, "simulate", simulate)
     experiment = Experiment(tiny_runs.scenario(), tiny_runs.config(STRICT))
     mesh = Mesh(np.array(jax.local_devices()[:1]), ("lane",))
-    lanes = module._run_lanes(experiment, {}, jnp.arange(NUM_SEEDS, dtype=jnp.uint32), KEY, mesh, NUM_SEEDS)
+    seeds, everyone = jnp.arange(NUM_SEEDS, dtype=jnp.uint32), jnp.ones(NUM_SEEDS, bool)
+    lanes = module._run_lanes(experiment, {}, seeds, everyone, KEY, mesh, NUM_SEEDS)
     assert lanes["is_finite"].tolist() == [seed != bad_seed for seed in range(NUM_SEEDS)]
 
     runs, good = strict_runs(), [0, 2]

@@ -29,7 +29,7 @@ def make_tiny(patch: pytest.MonkeyPatch) -> None:
     """Only the cells of the robot's forward motion, all of them small, and calls of one size."""
     patch.setattr(module, "cells", some_cells)
     patch.setattr(module, "cell_experiment", lambda cell: tiny_experiment(cell_experiment(cell)))
-    patch.setattr(monte_carlo_module, "MAX_LANES_PER_CALL", NUM_SEEDS)
+    patch.setattr(monte_carlo_module, "LANES_PER_CALL", NUM_SEEDS)
 
 
 def some_cells(tables=(2, 3, 4, 5)) -> list[Cell]:

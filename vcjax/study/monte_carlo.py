@@ -26,7 +26,7 @@ from vcjax.study.metrics import run_metrics
 from vcjax.study.results import as_dataset, import_xarray
 from vcjax.study.sweep import Experiment, Sweep, check_sweep, replace_at
 
-MAX_LANES_PER_CALL = 256
+LANES_PER_CALL = 64
 """Lanes in one compiled call: what is finished between two reports of progress, and a bound on memory."""
 
 
@@ -100,7 +100,7 @@ def run_lanes(
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm] (jax.Device is untyped)
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run a list of lanes, in calls of equal size so that one compilation serves all.
+    """Run a list of lanes, in calls of equal size so that one compilation serves any number of them.
 
     Args:
         experiment: scenario and configuration.
@@ -114,21 +114,31 @@ def run_lanes(
     """
     devices = jax.local_devices() if devices is None else list(devices)
     mesh = Mesh(np.array(devices), ("lane",))
-    total = len(seeds)
-    num_calls = math.ceil(total / MAX_LANES_PER_CALL)
-    size = math.ceil(total / num_calls / len(devices)) * len(devices)
-    batch_size = 1 if devices[0].platform == "cpu" else size
+    total, is_cpu = len(seeds), devices[0].platform == "cpu"
+    # On a CPU all calls have one size, whatever is asked for; elsewhere empty places cost, and there are none but in the
+    # last call.
+    places = math.ceil((LANES_PER_CALL if is_cpu else min(total, LANES_PER_CALL)) / len(devices))
     done = []
-    for first in range(0, total, size):
-        # The last call is filled up with copies of its last lane, to have the shape of the others.
-        lane = np.minimum(np.arange(first, first + size), total - 1)
+    for first in range(0, total, places * len(devices)):
+        new = np.arange(first, min(first + places * len(devices), total))
+        lane = _share(new, len(devices), places)
         values = {path: value[lane] for path, value in swept.items()}
-        result = _run_lanes(experiment, values, jnp.asarray(seeds[lane], jnp.uint32), key, mesh, batch_size)
-        num_new = min(size, total - first)
-        done.append({name: np.asarray(value)[:num_new] for name, value in result.items()})
+        args = (values, jnp.asarray(seeds[lane], jnp.uint32), jnp.asarray(lane >= 0))
+        result = _run_lanes(experiment, *args, key, mesh, batch_size=1 if is_cpu else places)
+        done.append({name: np.asarray(value)[lane >= 0] for name, value in result.items()})
         if progress is not None:
-            progress(first + num_new, total)
+            progress(first + len(new), total)
     return {name: np.concatenate([part[name] for part in done]) for name in done[0]}
+
+
+def _share(lanes: np.ndarray, num_devices: int, places: int) -> np.ndarray:
+    """Lanes in order, shared evenly by devices of so many places each; -1 for a place that stays empty."""
+    each = math.ceil(len(lanes) / num_devices)
+    shared = np.full((num_devices, places), -1)
+    for device in range(num_devices):
+        part = lanes[device * each : (device + 1) * each]
+        shared[device, : len(part)] = part
+    return shared.ravel()
 
 
 # On a CPU lanes are what runs in parallel: sharing each small product between threads as well only costs.
@@ -136,17 +146,23 @@ _ONE_THREAD_PER_LANE = {"xla_cpu_multi_thread_eigen": False}
 
 
 @partial(jax.jit, static_argnames=("mesh", "batch_size"), compiler_options=_ONE_THREAD_PER_LANE)
-def _run_lanes(experiment, swept, seeds, key, mesh: Mesh, batch_size: int) -> dict[str, Array]:
+def _run_lanes(experiment, swept, seeds, is_there, key, mesh: Mesh, batch_size: int) -> dict[str, Array]:
     def run_lane(lane):
-        swept, seed = lane
-        return run_one(replace_at(experiment, swept), jax.random.fold_in(key, seed))
+        swept, seed, is_there = lane
 
-    def run_part(swept, seeds):
-        return jax.lax.map(run_lane, (swept, seeds), batch_size=None if batch_size == 1 else batch_size)
+        def work():
+            return run_one(replace_at(experiment, swept), jax.random.fold_in(key, seed))
+
+        # An empty place costs nothing where lanes run one by one.
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(work))
+        return jax.lax.cond(is_there, work, lambda: nothing)
+
+    def run_part(*lanes):
+        return jax.lax.map(run_lane, lanes, batch_size=None if batch_size == 1 else batch_size)
 
     lanes = PartitionSpec("lane")
     # Lanes do not talk to each other, so there is nothing to check of what varies over the mesh.
-    return jax.shard_map(run_part, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)(swept, seeds)
+    return jax.shard_map(run_part, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)(swept, seeds, is_there)
 
 
 def run_one(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Array]:
