@@ -70,6 +70,7 @@ def fake_runs(cell: Cell | None = None, num_seeds: int = 4, num_frames: int = 20
             "num_inconsistent": (per_frame, events(inconsistent_deletions.sum(1))),
             "num_births": (per_frame, np.ones((num_seeds, num_frames), int)),
             "num_landmarks": (per_frame, np.tile(9 + frames, (num_seeds, 1))),
+            "num_coordinates": (per_frame, np.tile(77 + 7 * frames, (num_seeds, 1))),
             "dynamic_deletions": (("seed", "feature"), dynamic_deletions),
             "inconsistent_deletions": (("seed", "feature"), inconsistent_deletions),
             "frames_mapped": (("seed", "feature"), np.full((num_seeds, len(features)), num_frames)),

@@ -14,6 +14,7 @@ from tiny_runs import NUM_SEEDS, compilations
 
 import vcjax as vc
 from vcjax.cli import main
+from vcjax.study import benchmark
 from vcjax.study import monte_carlo as monte_carlo_module
 from vcjax.study import reproduce as reproduce_module
 from vcjax.study.paper import cells
@@ -65,7 +66,7 @@ def test_gate_is_the_last_one_named(options, gate, th1, tmp_path, monkeypatch, c
         seen.append(config)
         return fake_runs(num_seeds=2)
 
-    monkeypatch.setattr("vcjax.cli.monte_carlo", monte_carlo)
+    monkeypatch.setattr("vcjax.commands.monte_carlo", monte_carlo)
     assert main(["run", *options]) == 0
     assert type(seen[0].gate).__name__ == gate and seen[0].gate.th1 == th1
     assert len(list(tmp_path.rglob("*"))) >= 1
@@ -74,7 +75,7 @@ def test_gate_is_the_last_one_named(options, gate, th1, tmp_path, monkeypatch, c
 def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
     seen = []
     monkeypatch.setattr(
-        "vcjax.cli.monte_carlo", lambda *given, **more: seen.append((*given, more)) or fake_runs(num_seeds=2)
+        "vcjax.commands.monte_carlo", lambda *given, **more: seen.append((*given, more)) or fake_runs(num_seeds=2)
     )
     options = "--robot curved --dynamic-set 3 4 5 --noise six_axis --pixel-error-std-px 0.5 --pixel-std-px 2 "
     options += "--min-searches 7 --no-retire --update stacked --prior predicted --th2 0"
@@ -89,7 +90,7 @@ def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
 
 def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsys):
     seen = []
-    monkeypatch.setattr("vcjax.cli.monte_carlo", lambda *given, **_: seen.append(given) or fake_runs(num_seeds=2))
+    monkeypatch.setattr("vcjax.commands.monte_carlo", lambda *given, **_: seen.append(given) or fake_runs(num_seeds=2))
     options = "--start 1 2 30 --increment 0.1 0 -1 --odometry-std 1 2 3 4 5 6 --mount 0 0 1 -80 0 -90 "
     options += "--intrinsics-px 300 200 250 251 --image-size-px 600 400 --distortion 0.1 -0.02 "
     options += "--grid-low-m -4 --grid-high-m 4 --grid-per-side 5 --grid-heights-m 0.5 --dynamic-direction 1 0 1 "
@@ -243,7 +244,7 @@ def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path)
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vcjax.cli.reproduce", interrupt)
+    monkeypatch.setattr("vcjax.commands.reproduce", interrupt)
     assert main(["reproduce", "--out", str(tmp_path)]) == 130
     assert "stopped; what `vcjax reproduce` has finished is on disk" in said(capsys)[1]
 
@@ -286,3 +287,21 @@ def test_installed_command_starts_with_one_line_for_bad_input(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stdout == ""
     assert_one_line(done.stderr, "num_seeds=0")
+
+
+def test_bench_saves_each_part_as_it_is_measured_and_tells_what_became_worse(tmp_path, monkeypatch, capsys):
+    def fail():
+        raise OSError("no more of this")
+
+    parts = {"cell": lambda: {"cell_warm_s": 1.25, "ratio_to_floor": np.pi}, "seeds": fail}
+    monkeypatch.setattr(benchmark, "PARTS", parts)
+    numbers, baseline = tmp_path / "bench.json", tmp_path / "baseline.json"
+    assert main(["bench", "--only", "cell", "seeds", "--json", str(numbers)]) == 1
+    saved = json.loads(numbers.read_text())
+    assert (saved["cell_warm_s"], saved["ratio_to_floor"]) == (1.25, np.pi)
+    assert {"device", "num_devices", "dtype", "jax"} <= set(saved)
+    baseline.write_text(json.dumps({"ratios": {"ratio_to_floor": 2.0}, "tolerance": 1.2}))
+    said(capsys)
+    assert main(["bench", "--only", "cell", "--baseline", str(baseline)]) == 1
+    out, told = said(capsys)
+    assert "cell_warm_s" in out and "more than 1.2 times the accepted 2.00" in told

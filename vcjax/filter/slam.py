@@ -14,6 +14,7 @@ from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import choose, match, predict_features
+from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state, slot_count
 from vcjax.filter.submap import gather, normalise, scatter
 from vcjax.gates.gate import Evidence
@@ -56,6 +57,8 @@ class FrameInfo(eqx.Module):
     """Features initialised; -1 for an attempt without a birth."""
     track_id: Int[Array, " L"]
     """Feature held by each slot at the end of the frame; -1 where free."""
+    num_coordinates: Int[Array, ""]
+    """N, the length of the state at the end of the frame: 14, and 7 (AHP) or 3 (Euclidean) for each landmark."""
     map_is_full: Bool[Array, ""]
     """Whether a feature waits for a free slot."""
     is_finite: Bool[Array, ""]
@@ -204,6 +207,7 @@ def _finish(
         vehicle_cov=vehicle_cov,
         born_id=jnp.full(attempts, FREE, born.dtype).at[:num_births].set(born),
         track_id=state.track_id,
+        num_coordinates=VEHICLE + jnp.sum(jnp.where(state.is_mapped, jnp.where(state.is_euclidean, 3, SLOT), 0)),
         map_is_full=is_full,
         is_finite=jnp.all(jnp.isfinite(state.vehicle)) & jnp.all(jnp.isfinite(vehicle_cov)),
         **info_of_candidates,
@@ -236,5 +240,7 @@ def _run(config, recording, key):
     def advance(state, t):
         return step(config, state, recording.frame(t))
 
+    if config.reverse_mode:  # keep each frame's state only, and pass through the frame again on the way back
+        advance = jax.checkpoint(advance)
     state, rest = jax.lax.scan(advance, state, jnp.arange(1, recording.num_frames))
     return state, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)

@@ -28,6 +28,7 @@ def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
         "num_inconsistent": jnp.sum(info.inconsistent_id >= 0, axis=1),
         "num_births": jnp.sum(info.born_id >= 0, axis=1),
         "num_landmarks": jnp.sum(info.track_id >= 0, axis=1),
+        "num_coordinates": info.num_coordinates,
         "dynamic_deletions": _count_by_feature(dynamic_id, num_features),
         "inconsistent_deletions": _count_by_feature(info.inconsistent_id, num_features),
         "frames_mapped": _count_by_feature(info.track_id, num_features),

@@ -115,8 +115,7 @@ def run_lanes(
     devices = jax.local_devices() if devices is None else list(devices)
     mesh = Mesh(np.array(devices), ("lane",))
     total, is_cpu = len(seeds), devices[0].platform == "cpu"
-    # On a CPU all calls have one size, whatever is asked for; elsewhere empty places cost, and there are none but in the
-    # last call.
+    # On a CPU all calls have one size, whatever is asked for; elsewhere empty places cost: only the last call has any.
     places = math.ceil((LANES_PER_CALL if is_cpu else min(total, LANES_PER_CALL)) / len(devices))
     done = []
     for first in range(0, total, places * len(devices)):

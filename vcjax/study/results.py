@@ -38,6 +38,7 @@ PER_FRAME = {
     "num_inconsistent": "deleted by the detector",
     "num_births": "features initialised",
     "num_landmarks": "landmarks in the map",
+    "num_coordinates": "length of the state",
 }
 PER_FEATURE = {
     "dynamic_deletions": "how often the gate called a feature dynamic",

@@ -1,0 +1,220 @@
+"""How long the work takes, beside what it could take at least.
+
+All times are wall-clock seconds of one session on this machine, the median of several repeats where a repeat is cheap.
+Machines differ and are shared, so what may be compared between sessions are ratios measured within one.
+"""
+
+import importlib
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from scipy.linalg import get_blas_funcs
+from threadpoolctl import threadpool_limits
+
+from vcjax.filter.config import FilterConfig
+from vcjax.simulation.scenarios import Scenario, paper
+from vcjax.simulation.simulate import simulate
+from vcjax.study.monte_carlo import monte_carlo, run_one
+from vcjax.study.sweep import Experiment, replace_at
+
+NUM_SEEDS = 25
+"""Runs of the cell: the paper's."""
+PARAMETERS = {
+    "config.gate.th1": 9.0,
+    "config.gate.th2": 9.0,
+    "scenario.oscillation.amplitude_m": 0.05,
+    "scenario.oscillation.frequency_hz": 3.0,
+}
+"""What the gradients are by, and where."""
+
+
+def measure_cell(repeats: int = 5) -> dict[str, Any]:
+    """The paper's forward VC cell, 25 runs of 160 frames: compilation, warm time, the floor, peak memory.
+
+    The floor is what one core needs for the least that a frame must do: one symmetric update P - UᵀU of the state's
+    covariance, by BLAS `dsyrk`, with the size and rank that every frame of every run really had.
+    """
+    scenario, key = paper(), jax.random.key(0)
+    first, runs = timed(lambda: monte_carlo(scenario, num_seeds=NUM_SEEDS, key=key))
+    warm = statistics.median(
+        timed(lambda: monte_carlo(scenario, num_seeds=NUM_SEEDS, key=key))[0] for _ in range(repeats)
+    )
+    floor = floor_s(runs)
+    return {
+        "cell_compile_s": first - warm,
+        "cell_warm_s": warm,
+        "frames_per_second": NUM_SEEDS * scenario.num_frames / warm,
+        "floor_s": floor,
+        "ratio_to_floor": warm / floor,
+        "peak_memory_mib": peak_memory_mib(),
+    }
+
+
+def floor_s(runs: xr.Dataset) -> float:
+    """Seconds of one core for `dsyrk` on the state's covariance, once for every frame of every run."""
+    sizes = runs.num_coordinates.values.ravel()
+    ranks = 2 * (runs.num_updates + runs.num_recovered).values.ravel()
+    largest, rng = int(sizes.max()), np.random.default_rng(0)
+    P = rng.standard_normal((largest, largest))
+    U = rng.standard_normal((largest, max(int(ranks.max()), 1)))
+    (syrk,) = get_blas_funcs(("syrk",), (P,))
+    seconds = 0.0
+    with threadpool_limits(1):
+        for size, rank in zip(sizes, ranks, strict=True):
+            block, rows = np.asfortranarray(P[:size, :size]), np.asfortranarray(U[:size, :rank])
+            if rank:
+                seconds += timed(lambda block=block, rows=rows: syrk(-1.0, rows, 1.0, block, overwrite_c=True))[0]
+    return seconds
+
+
+def measure_seeds(counts: tuple[int, ...] = (1, 25, 100, 1000)) -> dict[str, float]:
+    """Warm seconds of the cell for other numbers of runs; nothing compiles again for them on a CPU."""
+    seconds = {}
+    for count in counts:
+        if jax.default_backend() != "cpu":
+            monte_carlo(paper(), num_seeds=count, key=jax.random.key(0))
+        seconds[str(count)] = timed(lambda count=count: monte_carlo(paper(), num_seeds=count, key=jax.random.key(0)))[0]
+    return seconds
+
+
+def measure_gradients(repeats: int = 3) -> dict[str, Any]:
+    """Value and gradient of one run's mean position error by Th₁, Th₂, A and f, over the time of a plain run.
+
+    Forward mode (`jacfwd`, four tangents at once) and reverse mode, each against the plain run of one seed, all on one
+    device and compiled.
+    """
+
+    def loss(config: FilterConfig, values: dict[str, Any]) -> Any:
+        experiment = replace_at(Experiment(paper(), config), values)
+        return jnp.mean(run_one(experiment, jax.random.key(0))["position_error_m"])
+
+    hard, reverse = FilterConfig(), FilterConfig(reverse_mode=True)
+    values = {path: jnp.asarray(value) for path, value in PARAMETERS.items()}
+    functions: dict[str, Callable[..., Any]] = {
+        "plain": lambda values: loss(hard, values),
+        "forward": jax.jacfwd(lambda values: (loss(hard, values),) * 2, has_aux=True),
+        "reverse": jax.value_and_grad(lambda values: loss(reverse, values)),
+    }
+    seconds = {}
+    for name, function in functions.items():
+        compiled = jax.jit(function).lower(values).compile()
+        jax.block_until_ready(compiled(values))
+        seconds[name] = statistics.median(
+            timed(lambda compiled=compiled: jax.block_until_ready(compiled(values)))[0] for _ in range(repeats)
+        )
+    return {
+        "run_s": seconds["plain"],
+        "gradient_forward_ratio": seconds["forward"] / seconds["plain"],
+        "gradient_reverse_ratio": seconds["reverse"] / seconds["plain"],
+    }
+
+
+def measure_reproduce() -> dict[str, Any]:
+    """`vcjax reproduce`, whole, as a process of its own: start, compilation, 36 cells, tables and figures."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "vcjax", "reproduce", "--out", folder]
+        seconds, _ = timed(lambda: subprocess.run(command, check=True, capture_output=True))
+    return {"reproduce_s": seconds, "reproduce_peak_memory_mib": peak_memory_mib(of_children=True)}
+
+
+def measure_numpy(tests: Path, num_runs: int = 2) -> dict[str, Any]:
+    """The same cell by the plain NumPy EKF-SLAM of the tests, from `num_runs` runs scaled up to 25.
+
+    It is written to be read, with dense textbook updates and derivatives by complex steps: a peer to check numbers
+    with, not a fast one. None where its folder is not there, as outside a checkout.
+    """
+    if not (tests / "reference" / "ekf_slam.py").is_file():
+        return {"numpy_cell_s": None}
+    sys.path.insert(0, str(tests))
+    reference = importlib.import_module("reference.ekf_slam")
+    scenario: Scenario = paper()
+    seconds = 0.0
+    for seed in range(num_runs):
+        r = jax.device_get(simulate(scenario, jax.random.fold_in(jax.random.key(0), seed))[0])
+        seen = r.is_valid
+        frames = [
+            reference.Frame(
+                r.odometry[t], r.odometry_cov[t], r.sensor_shift_m[t], r.track_id[t, seen[t]], r.uv_px[t, seen[t]]
+            )
+            for t in range(scenario.num_frames)
+        ]
+        start = (r.camera.intrinsics_px, r.robot_start, r.sensor_start, r.start_cov)
+        seconds += timed(lambda start=start, frames=frames: reference.run(reference.Options(), *start, frames))[0]
+    return {"numpy_cell_s": seconds * NUM_SEEDS / num_runs, "numpy_runs": num_runs}
+
+
+def where() -> dict[str, Any]:
+    """What was measured on."""
+    devices = jax.local_devices()
+    return {
+        "device": devices[0].device_kind,
+        "num_devices": len(devices),
+        "cpu_count": os.cpu_count(),
+        "machine": platform.machine(),
+        "dtype": str(jax.dtypes.canonicalize_dtype(np.float64)),
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def peak_memory_mib(of_children: bool = False) -> float | None:
+    """Largest resident memory of this process so far, or of its children, MiB; None where the system cannot tell."""
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return None
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN if of_children else resource.RUSAGE_SELF)
+    return usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+PARTS: dict[str, Callable[[], dict[str, Any]]] = {
+    "cell": measure_cell,
+    "seeds": lambda: {"seconds_by_seeds": measure_seeds()},
+    "gradients": measure_gradients,
+    "numpy": lambda: measure_numpy(Path("tests")),
+    "reproduce": measure_reproduce,
+}
+"""What can be measured, by name, in the order in which it is."""
+
+
+def timed(work: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds that some work takes, and what it returns."""
+    start = time.perf_counter()
+    result = work()
+    return time.perf_counter() - start, result
+
+
+def compare(measured: dict[str, Any], baseline: Path) -> list[str]:
+    """The ratios that have become worse than a baseline by more than its tolerance, as sentences.
+
+    Args:
+        measured: what this session measured.
+        baseline: JSON with `ratios`, the accepted value of each, and `tolerance`, a factor.
+
+    Raises:
+        ValueError: if the file is no baseline.
+        OSError: if it cannot be read.
+    """
+    try:
+        accepted = json.loads(baseline.read_text())
+        ratios, tolerance = accepted["ratios"], float(accepted["tolerance"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{baseline}: no baseline of `vcjax bench` ({error!r}).") from None
+    return [
+        f"{name} is {measured[name]:.2f}, more than {tolerance:g} times the accepted {value:.2f}"
+        for name, value in ratios.items()
+        if measured.get(name) is not None and measured[name] > tolerance * value
+    ]
