@@ -9,6 +9,7 @@ import tiny_runs
 from tiny_runs import compilations
 
 import vcjax as vc
+from vcjax.study.reproduce import reproduce
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
 
@@ -162,6 +163,38 @@ CALLS = {
         lambda r: vc.monte_carlo(tiny_runs.scenario(), vc.VirtualCorrection(), key=KEY),
         r"monte_carlo\(config=.*VirtualCorrection.*\): give a FilterConfig",
     ),
+    "run with several values": (
+        lambda r: vc.run(vc.FilterConfig(pixel_std_px=jax.device_put(np.array([1.0, 2.0]))), r),
+        r"run: FilterConfig\(pixel_std_px\) has shape \(2,\), but one number is needed.*sweep.*vmap",
+    ),
+    "many runs with several values": (
+        lambda r: vc.monte_carlo(
+            tiny_runs.scenario(), vc.FilterConfig(vc.VirtualCorrection(jax.device_put(np.ones(3)))), key=KEY
+        ),
+        r"monte_carlo: VirtualCorrection\(th1\) has shape \(3,\)",
+    ),
+    "simulate several values": (
+        lambda r: vc.simulate(tiny_runs.scenario(pixel_error_std_px=jax.device_put(np.ones(2))), KEY),
+        r"simulate: Scenario\(pixel_std_px\) has shape \(2,\)",
+    ),
+    "sweep without values": (
+        lambda r: vc.monte_carlo(tiny_runs.scenario(), key=KEY, sweep=["config.gate.th1"]),
+        r"monte_carlo\(sweep=\['config.gate.th1'\]\): give paths with their values",
+    ),
+    "a number of devices": (
+        lambda r: vc.monte_carlo(tiny_runs.scenario(), key=KEY, devices=2),
+        r"monte_carlo\(devices=2\): give a list of at least one device",
+    ),
+    "step without state": (
+        lambda r: vc.step(vc.FilterConfig(), None, None),
+        r"step\(state=None\): give a state as vcjax.start",
+    ),
+    "reproduce half a seed": (
+        lambda r: reproduce("nowhere", num_seeds=2.5),
+        r"reproduce\(num_seeds=2.5\): give at least one seed, a whole number",
+    ),
+    "reproduce one table": (lambda r: reproduce("nowhere", tables=3), r"reproduce\(tables=3\): give a list"),
+    "reproduce with a seed": (lambda r: reproduce("nowhere", key=3), r"reproduce\(key=3\): give one random key"),
     "many runs without key": (
         lambda r: vc.monte_carlo(tiny_runs.scenario(), key=None),
         r"monte_carlo\(key=None\): give one random key",
@@ -173,4 +206,17 @@ CALLS = {
 def test_what_is_of_another_kind_is_refused(call, message, recording):
     with compilations() as compiled, pytest.raises(ValueError, match=message):
         call(recording)
+    assert compiled.num == 0
+
+
+def test_a_step_with_what_does_not_belong_together_is_refused(recording):
+    state, _ = tiny_runs.start_once(tiny_runs.config(), recording)
+    frame = jax.device_get(recording.frame(1))
+    with compilations() as compiled:
+        with pytest.raises(ValueError, match=r"step\(state\) has 36 slots, but config \(max_landmarks=107\) needs 108"):
+            vc.step(vc.FilterConfig(), state, frame)
+        with pytest.raises(ValueError, match=r"step\(frame.uv_px\) has shape \(3, 2\), but .* is needed: one row for"):
+            vc.step(tiny_runs.config(), state, dataclasses.replace(frame, uv_px=np.ones((3, 2))))
+        with pytest.raises(ValueError, match=r"step\(frame=None\): give a frame"):
+            vc.step(tiny_runs.config(), state, None)
     assert compiled.num == 0

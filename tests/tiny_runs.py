@@ -9,7 +9,7 @@ import numpy as np
 from quick import QUICK
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.slam import run
+from vcjax.filter.slam import run, start
 from vcjax.gates.gate import AbstractGate
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import Scenario, paper
@@ -30,6 +30,7 @@ MEASURES = (*PER_FRAME, *PER_FEATURE, *PER_RUN, "robot", "is_moving")
 STRICT = VirtualCorrection(th1=1.0, th2=0.7)
 
 simulate_once, run_once = jax.jit(simulate, compiler_options=QUICK), jax.jit(run, compiler_options=QUICK)
+start_once = jax.jit(start, compiler_options=QUICK)
 # The inside of `monte_carlo` as it is, but compiled quickly.
 module._run_lanes = jax.jit(
     module._run_lanes.__wrapped__, static_argnames=("mesh", "batch_size"), compiler_options=QUICK

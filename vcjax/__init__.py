@@ -8,7 +8,7 @@ nothing, starts no device and leaves JAX's configuration alone; for the paper's 
 import typing
 
 from vcjax.filter.config import FilterConfig as FilterConfig
-from vcjax.filter.slam import FrameInfo as FrameInfo
+from vcjax.filter.info import FrameInfo as FrameInfo
 from vcjax.filter.slam import run as run
 from vcjax.filter.slam import start as start
 from vcjax.filter.slam import step as step

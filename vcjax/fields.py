@@ -6,6 +6,7 @@ are already JAX arrays (a tracer, a batch for `vmap`) pass through. So does what
 converter knows no name, and `require` refuses it by field and value.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import Any
@@ -112,6 +113,25 @@ def require_kind(owner: str, name: str, value: object, kind: type, remedy: str) 
     """
     if not isinstance(value, kind):
         raise ValueError(f"{owner}({name}={_shown(value)}): {remedy}")
+
+
+def require_single(function: str, tree: Any) -> None:
+    """Refuse a configuration object, or one nested in it, with several values where a number is needed.
+
+    JAX arrays of any shape may be its fields, to be taken apart by `vmap`; what is not taken apart ends here.
+
+    Raises:
+        ValueError: naming function, class, field, shape and remedy.
+    """
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        if dataclasses.is_dataclass(value):
+            require_single(function, value)
+        elif field.type is float and np.ndim(value) > 0:
+            raise ValueError(
+                f"{function}: {type(tree).__name__}({field.name}) has shape {np.shape(value)}, but one number is "
+                "needed: for several values use `sweep` of `monte_carlo`, or `jax.vmap`."
+            )
 
 
 def require_key(owner: str, key: object) -> None:

@@ -190,8 +190,8 @@ def _refuse_types(recording: Recording) -> None:
             "track_id": (jnp.integer, "ids are integers"),
             "is_valid": (jnp.bool_, "give booleans"),
             "is_last": (jnp.bool_, "give booleans"),
-        }.get(name, (jnp.number, "give real numbers"))
-        if not jnp.issubdtype(value.dtype, kind) or jnp.issubdtype(value.dtype, jnp.complexfloating):
+        }.get(name, (jnp.floating, "give floating-point numbers"))
+        if not jnp.issubdtype(value.dtype, kind):
             raise ValueError(f"Recording({name}) is {value.dtype}; {needed}.")
     require_kind("Recording", "camera", recording.camera, Camera, "give a vcjax.Camera.")
 

@@ -12,7 +12,7 @@ from quick import QUICK
 
 from vcjax.filter import slam
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.slam import FrameInfo
+from vcjax.filter.info import FrameInfo
 from vcjax.filter.state import SLOT, VEHICLE, FilterState, full_cov, landmark_cov
 from vcjax.recording import Frame, Recording
 from vcjax.simulation.scenarios import paper

@@ -229,3 +229,34 @@ def test_other_numbers_compile_nothing_new():
 
 def _is_int(leaf):
     return np.issubdtype(np.asarray(leaf).dtype, np.integer)
+
+
+@pytest.mark.parametrize("amplitude_m", [0.0, 0.05])
+def test_a_point_that_comes_towards_the_camera_mimics_a_nearer_static_one(amplitude_m):
+    """Moving at -βu under a straight path u it is seen as a static point at 1/(1+β) of its distance.
+
+    Exactly so by a steady camera; the oscillating one sees the two f A β sin(2πft)/d apart, d the mover's depth.
+    """
+    beta, camera = 0.5, np.array([-8.0, 0.0, 0.6])  # the camera before the first frame
+    mover = np.array([4.0, -2.0, 1.0])
+    mimic = camera + (mover - camera) / (1 + beta)
+    scenario = paper(
+        dynamic="inverse_forward",
+        dynamic_speed_m_s=beta * 0.5,
+        pixel_error_std_px=0.0,
+        oscillation_amplitude_m=amplitude_m,
+    )
+    ids = np.asarray(scenario.movers.ids)
+    is_mover = np.all(scenario.landmarks_m[ids] == mover, axis=1)
+    places = np.array(scenario.landmarks_m)
+    places[0] = mimic
+    recording, truth = run(eqx.tree_at(lambda s: s.landmarks_m, scenario, places), KEY)
+    moving = ids[is_mover][0]
+    apart = np.asarray(recording.uv_px[:, moving] - recording.uv_px[:, 0])
+    depth = np.asarray(truth.landmarks_m[:, moving, 0] - truth.robot[:, 0])
+    au = np.asarray(recording.camera.intrinsics_px)[2]
+    swing = amplitude_m * np.sin(2 * np.pi * 3.0 * np.asarray(recording.time_s))
+    in_front = depth > 0.5
+    assert in_front.sum() > 80
+    np.testing.assert_allclose(apart[in_front, 1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(apart[in_front, 0]), np.abs(au * beta * swing / depth)[in_front], atol=1e-9)

@@ -141,6 +141,12 @@ def test_other_schema_is_refused(tmp_path, schema):
         load(path)
 
 
+def test_file_that_lacks_a_variable_is_refused(tmp_path):
+    path = save(runs().drop_vars(["is_finite", "robot"]), tmp_path / "runs.nc")
+    with pytest.raises(ValueError, match=r"runs.nc: lacks is_finite, robot; remove it"):
+        load(path)
+
+
 def test_other_netcdf_file_is_refused(tmp_path):
     xr.Dataset({"a": ("x", [1.0])}).to_netcdf(tmp_path / "other.nc", engine="netcdf4")
     shutil.copy(tmp_path / "other.nc", tmp_path / "copy.nc")

@@ -9,7 +9,7 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 
-from vcjax.fields import number, require, require_choice, require_count, require_key, require_kind
+from vcjax.fields import number, require, require_choice, require_count, require_key, require_kind, require_single
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.virtual_correction import VirtualCorrection
@@ -96,11 +96,12 @@ class FilterConfig(eqx.Module):
 
 
 def check_arguments(function: str, config: object, key: object) -> None:
-    """Refuse what is no configuration, or no random key, before a function starts to work with it.
+    """Refuse what is no configuration of one run, or no random key, before a function starts to work with it.
 
     Raises:
         ValueError: naming function, argument, what was given and remedy.
     """
     require_kind(function, "config", config, FilterConfig, "give a FilterConfig, e.g. vcjax.FilterConfig().")
+    require_single(function, config)
     if key is not None:
         require_key(function, key)

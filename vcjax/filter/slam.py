@@ -8,61 +8,20 @@ detector flagged; retirement of what cannot matter any more; births.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, PRNGKeyArray
 
+from vcjax.fields import require_kind
 from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import choose, match, predict_features
+from vcjax.filter.info import FrameInfo
 from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state, slot_count
 from vcjax.filter.submap import gather, normalise, scatter
 from vcjax.gates.gate import Evidence
 from vcjax.models.motion import move_by_odometry
 from vcjax.recording import Frame, Recording, validate
-
-
-class FrameInfo(eqx.Module):
-    """What a person wants to see of a frame. K candidates, L slots."""
-
-    vehicle: Float[Array, "14"]
-    """Robot and sensor pose at the end of the frame."""
-    vehicle_cov: Float[Array, "14 14"]
-    """Their covariance."""
-    candidate_id: Int[Array, " K"]
-    """Feature of each candidate for update, most uncertain first; -1 where there was none."""
-    is_measured: Bool[Array, " K"]
-    """Found in the image."""
-    pixel: Float[Array, "K 2"]
-    """Predicted pixel ê at the state it was tested at, px. Meaningless, like all below, where not measured."""
-    innovation: Float[Array, "K 2"]
-    """z = y - ê, px. Equation (8)."""
-    innovation_cov: Float[Array, "K 2 2"]
-    """Z = H P Hᵀ + R, px². Equation (9)."""
-    re1: Float[Array, " K"]
-    """RE₁ as gated. Equation (13)."""
-    re1_prior: Float[Array, " K"]
-    """RE₁ at the gate's prior, of the isolated; NaN elsewhere."""
-    re2: Float[Array, " K"]
-    """RE₂ of the isolated; NaN elsewhere. Equation (14)."""
-    is_accepted: Bool[Array, " K"]
-    """Corrected with directly."""
-    is_recovered: Bool[Array, " K"]
-    """Isolated, then corrected with."""
-    is_dynamic: Bool[Array, " K"]
-    """Isolated, called dynamic by the gate and deleted."""
-    inconsistent_id: Int[Array, " L"]
-    """Features deleted by the detector; -1 elsewhere."""
-    born_id: Int[Array, " births"]
-    """Features initialised; -1 for an attempt without a birth."""
-    track_id: Int[Array, " L"]
-    """Feature held by each slot at the end of the frame; -1 where free."""
-    num_coordinates: Int[Array, ""]
-    """N, the length of the state at the end of the frame: 14, and 7 (AHP) or 3 (Euclidean) for each landmark."""
-    map_is_full: Bool[Array, ""]
-    """Whether a feature waits for a free slot."""
-    is_finite: Bool[Array, ""]
-    """Whether the vehicle's mean and covariance are finite numbers."""
 
 
 def predict(config: FilterConfig, state: FilterState, frame: Frame) -> FilterState:
@@ -86,7 +45,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     """One frame of EKF-SLAM.
 
     Pure; works under `jit`, `vmap`, `scan` and differentiation (exact derivatives of all that is continuous; choices
-    and verdicts have zero derivative). Raises nothing: look at `is_finite` and `map_is_full`.
+    and verdicts have zero derivative). What happens in a run raises nothing: look at `is_finite` and `map_is_full`.
 
     Args:
         config: filter configuration.
@@ -94,7 +53,12 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         frame: odometry and features.
 
     Returns: the state after this frame, and its info.
+
+    Raises:
+        ValueError: for what is no configuration, state or frame, or a state of another configuration's size, before
+            anything compiles.
     """
+    _check_step(config, state, frame)
     state = predict(config, state, frame)
     prediction = predict_features(config, state, frame.camera)
     column = match(state, frame)
@@ -147,6 +111,24 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     place = jnp.where(state.is_mapped & (column >= 0), column, num_features)
     is_mapped = jnp.zeros(num_features, bool).at[place].set(True, mode="drop")
     return _finish(config, state, frame, is_mapped, config.births_per_frame, info_of_candidates)
+
+
+def _check_step(config: FilterConfig, state: FilterState, frame: Frame) -> None:
+    """Refuse what `step` cannot work with, as far as kinds and shapes tell."""
+    check_arguments("step", config, None)
+    require_kind("step", "state", state, FilterState, "give a state as vcjax.start or vcjax.step returns it.")
+    require_kind("step", "frame", frame, Frame, "give a frame, e.g. recording.frame(t).")
+    num_slots, needed = state.track_id.shape[-1], slot_count(config)
+    if num_slots != needed:
+        raise ValueError(
+            f"step(state) has {num_slots} slots, but config (max_landmarks={config.max_landmarks}) needs {needed}: "
+            "go on with the configuration that `start` was given."
+        )
+    num_features = frame.track_id.shape
+    for name, shape in (("uv_px", (*num_features, 2)), ("is_valid", num_features), ("is_last", num_features)):
+        if getattr(frame, name).shape != shape:
+            found = getattr(frame, name).shape
+            raise ValueError(f"step(frame.{name}) has shape {found}, but {shape} is needed: one row for each track_id.")
 
 
 def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None) -> tuple[FilterState, FrameInfo]:

@@ -9,10 +9,10 @@ f(x_AHP), only the mean changes its form; P keeps its seven rows and `to_coordin
 that moment. As Kalman updates are linear in the error, using H J with the old rows gives, ever after, exactly the
 numbers that P's rows transformed by J would give, and no pass over P is needed.
 
-A free slot's rows hold whatever they held before: the numbers of a landmark that is never looked at again. They are as
-inert as zeros would be, and cost nothing to leave. L is the capacity rounded up to whole blocks of slots with at least
-one to spare: the last slot, always free, takes the writes of births that do not happen, so that no branch and no copy
-of P is needed.
+A free slot's rows hold whatever finite numbers they held before: those of a landmark that is never looked at again.
+They are as inert as zeros would be, and cost nothing to leave. L is the capacity rounded up to whole blocks of slots
+with at least one to spare: the last slot, always free, takes the writes of births that do not happen, so that no branch
+and no copy of P is needed.
 """
 
 import equinox as eqx

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from vcjax.fields import require_key, require_kind
+from vcjax.fields import require_key, require_kind, require_single
 from vcjax.models.camera import is_inside, project
 from vcjax.models.frames import compose, quaternion_from_euler, to_frame
 from vcjax.models.motion import move_by_odometry, oscillate
@@ -36,6 +36,7 @@ def simulate(scenario: Scenario, key: PRNGKeyArray) -> tuple[Recording, Truth]:
         ValueError: for a scenario that is none, or what is not one random key.
     """
     require_kind("simulate", "scenario", scenario, Scenario, "give a Scenario, e.g. vcjax.scenarios.paper().")
+    require_single("simulate", scenario)
     require_key("simulate", key)
     key_odometry, key_pixels = jax.random.split(key)
     num_frames, num_features = scenario.num_frames, scenario.landmarks_m.shape[-2]

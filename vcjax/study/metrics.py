@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vcjax.ekf import mahalanobis
-from vcjax.filter.slam import FrameInfo
+from vcjax.filter.info import FrameInfo
 from vcjax.models.frames import quaternion_conjugate, quaternion_product, yaw_from_quaternion
 from vcjax.recording import Truth
 

@@ -17,7 +17,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, PRNGKeyArray
 
-from vcjax.fields import require_key, require_kind
+from vcjax.fields import require_key, require_kind, require_single
 from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.slam import run
 from vcjax.simulation.scenarios import Scenario
@@ -82,14 +82,15 @@ def monte_carlo(
 def _check_arguments(scenario, config, num_seeds: int, first_seed: int, key, devices: Sequence | None) -> None:
     """Refuse what `monte_carlo` cannot run, naming argument, value and remedy."""
     require_kind("monte_carlo", "scenario", scenario, Scenario, "give a Scenario, e.g. vcjax.scenarios.paper().")
+    require_single("monte_carlo", scenario)
     check_arguments("monte_carlo", config, key)
     require_key("monte_carlo", key)
     if not isinstance(num_seeds, Integral) or num_seeds < 1:
         raise ValueError(f"monte_carlo(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
     if not isinstance(first_seed, Integral) or not 0 <= first_seed <= 2**32 - num_seeds:
         raise ValueError(f"monte_carlo(first_seed={first_seed!r}): seeds are whole numbers from 0 to 2**32 - 1.")
-    if devices is not None and len(devices) == 0:
-        raise ValueError("monte_carlo(devices=[]): give at least one device, or None for all.")
+    if devices is not None and (not isinstance(devices, Sequence) or len(devices) == 0):
+        raise ValueError(f"monte_carlo(devices={devices!r}): give a list of at least one device, or None for all.")
 
 
 def run_lanes(

@@ -8,6 +8,7 @@ smaller one.
 import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from vcjax.fields import require_key
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.gate import AbstractGate
 from vcjax.gates.reprojection import ReprojectionError
@@ -70,12 +72,13 @@ def reproduce(
             table: its cells are compared with each other).
         OSError: if the directory cannot be written.
     """
-    if num_seeds < 1:
-        raise ValueError(f"reproduce(num_seeds={num_seeds}): give at least one seed.")
-    if not tables:
-        raise ValueError(f"reproduce(tables={tuple(tables)}): give at least one of {TABLES}.")
+    if not isinstance(num_seeds, Integral) or num_seeds < 1:
+        raise ValueError(f"reproduce(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
+    if not isinstance(tables, Collection) or not tables:
+        raise ValueError(f"reproduce(tables={tables!r}): give a list of at least one of {TABLES}.")
     directory, chosen = Path(directory), cells(tables)
     key = jax.random.key(0) if key is None else key
+    require_key("reproduce", key)
     for cell in cells():
         for _, _, path in _blocks(directory / "runs" / cell.identifier):
             _refuse_other_settings(path, cell_experiment(cell), key)

@@ -164,11 +164,13 @@ def _read(path: str | os.PathLike, part: Callable[[Any], Any]) -> Any:
         raise FileNotFoundError(f"{path}: no such results file.")
     try:
         with xarray.open_dataset(path, engine="netcdf4") as dataset:
-            found, result = dataset.attrs.get("schema"), part(dataset)
+            found, names, result = dataset.attrs.get("schema"), set(dataset.variables), part(dataset)
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise ValueError(f"{path}: not a readable NetCDF-4 file ({error}); remove it and run again.") from error
     if found != SCHEMA:
         raise ValueError(f"{path}: schema {found}, but this version reads {SCHEMA}.")
+    if missing := sorted({*PER_FRAME, *PER_FEATURE, *PER_RUN, "robot", "is_moving"} - names):
+        raise ValueError(f"{path}: lacks {', '.join(missing)}; remove it and run again.")
     return result
 
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vcjax.fields import is_concrete
+from vcjax.fields import is_concrete, require_kind
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 
@@ -75,6 +75,9 @@ def check_sweep(experiment: Experiment, sweep: Sweep) -> dict[str, np.ndarray]:
         ValueError: for an unknown path (the message lists those there are), an empty or nested list of values, or a
             point of the grid that the objects it belongs to refuse.
     """
+    require_kind(
+        "monte_carlo", "sweep", sweep, Mapping, 'give paths with their values, {"config.gate.th1": [6, 9, 12]}.'
+    )
     known = list(numeric_paths(experiment))
     values = {}
     for path, listed in sweep.items():

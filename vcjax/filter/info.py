@@ -1,0 +1,47 @@
+"""FrameInfo: what a person wants to see of a frame, and the next frame does not need."""
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int
+
+
+class FrameInfo(eqx.Module):
+    """What a person wants to see of a frame. K candidates, L slots."""
+
+    vehicle: Float[Array, "14"]
+    """Robot and sensor pose at the end of the frame."""
+    vehicle_cov: Float[Array, "14 14"]
+    """Their covariance."""
+    candidate_id: Int[Array, " K"]
+    """Feature of each candidate for update, most uncertain first; -1 where there was none."""
+    is_measured: Bool[Array, " K"]
+    """Found in the image."""
+    pixel: Float[Array, "K 2"]
+    """Predicted pixel ê at the state it was tested at, px. Meaningless, like all below, where not measured."""
+    innovation: Float[Array, "K 2"]
+    """z = y - ê, px. Equation (8)."""
+    innovation_cov: Float[Array, "K 2 2"]
+    """Z = H P Hᵀ + R, px². Equation (9)."""
+    re1: Float[Array, " K"]
+    """RE₁ as gated. Equation (13)."""
+    re1_prior: Float[Array, " K"]
+    """RE₁ at the gate's prior, of the isolated; NaN elsewhere."""
+    re2: Float[Array, " K"]
+    """RE₂ of the isolated; NaN elsewhere. Equation (14)."""
+    is_accepted: Bool[Array, " K"]
+    """Corrected with directly."""
+    is_recovered: Bool[Array, " K"]
+    """Isolated, then corrected with."""
+    is_dynamic: Bool[Array, " K"]
+    """Isolated, called dynamic by the gate and deleted."""
+    inconsistent_id: Int[Array, " L"]
+    """Features deleted by the detector; -1 elsewhere."""
+    born_id: Int[Array, " births"]
+    """Features initialised; -1 for an attempt without a birth."""
+    track_id: Int[Array, " L"]
+    """Feature held by each slot at the end of the frame; -1 where free."""
+    num_coordinates: Int[Array, ""]
+    """N, the length of the state at the end of the frame: 14, and 7 (AHP) or 3 (Euclidean) for each landmark."""
+    map_is_full: Bool[Array, ""]
+    """Whether a feature waits for a free slot."""
+    is_finite: Bool[Array, ""]
+    """Whether the vehicle's mean and covariance are finite numbers."""
