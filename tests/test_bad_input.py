@@ -183,7 +183,7 @@ CALLS = {
     ),
     "a number of devices": (
         lambda r: vc.monte_carlo(tiny_runs.scenario(), key=KEY, devices=2),
-        r"monte_carlo\(devices=2\): give a list of at least one device",
+        r"monte_carlo\(devices=2\): give at least one device in a list",
     ),
     "step without state": (
         lambda r: vc.step(vc.FilterConfig(), None, None),
@@ -193,7 +193,10 @@ CALLS = {
         lambda r: reproduce("nowhere", num_seeds=2.5),
         r"reproduce\(num_seeds=2.5\): give at least one seed, a whole number",
     ),
-    "reproduce one table": (lambda r: reproduce("nowhere", tables=3), r"reproduce\(tables=3\): give a list"),
+    "reproduce one table": (
+        lambda r: reproduce("nowhere", tables=3),
+        r"reproduce\(tables=3\): give at least one of .* in a list",
+    ),
     "reproduce with a seed": (lambda r: reproduce("nowhere", key=3), r"reproduce\(key=3\): give one random key"),
     "many runs without key": (
         lambda r: vc.monte_carlo(tiny_runs.scenario(), key=None),

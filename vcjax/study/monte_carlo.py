@@ -90,7 +90,7 @@ def _check_arguments(scenario, config, num_seeds: int, first_seed: int, key, dev
     if not isinstance(first_seed, Integral) or not 0 <= first_seed <= 2**32 - num_seeds:
         raise ValueError(f"monte_carlo(first_seed={first_seed!r}): seeds are whole numbers from 0 to 2**32 - 1.")
     if devices is not None and (not isinstance(devices, Sequence) or len(devices) == 0):
-        raise ValueError(f"monte_carlo(devices={devices!r}): give a list of at least one device, or None for all.")
+        raise ValueError(f"monte_carlo(devices={devices!r}): give at least one device in a list, or None for all.")
 
 
 def run_lanes(

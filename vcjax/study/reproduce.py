@@ -75,7 +75,7 @@ def reproduce(
     if not isinstance(num_seeds, Integral) or num_seeds < 1:
         raise ValueError(f"reproduce(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
     if not isinstance(tables, Collection) or not tables:
-        raise ValueError(f"reproduce(tables={tables!r}): give a list of at least one of {TABLES}.")
+        raise ValueError(f"reproduce(tables={tables!r}): give at least one of {TABLES}, in a list.")
     directory, chosen = Path(directory), cells(tables)
     key = jax.random.key(0) if key is None else key
     require_key("reproduce", key)
