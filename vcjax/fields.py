@@ -73,7 +73,8 @@ def require(
             "for several values use `sweep` of `monte_carlo`, or a JAX array and `jax.vmap`."
         )
     if is_concrete(value) and (np.any(np.isnan(array)) or not np.all(condition(array))):
-        raise ValueError(f"{owner_name}({name}={np.asarray(value).tolist()}): {remedy}")
+        shown = np.asarray(value).tolist() if array.size <= 16 else f"<{array.shape} numbers, {_range(array)}>"
+        raise ValueError(f"{owner_name}({name}={shown}): {remedy}")
 
 
 def require_count(owner: object, name: str, minimum: int) -> None:
@@ -146,6 +147,11 @@ def require_key(owner: str, key: object) -> None:
             return
     found = f"{key.dtype}{list(key.shape)}" if isinstance(key, jax.Array) else _shown(key)
     raise ValueError(f"{owner}(key={found}): give one random key, e.g. jax.random.key(0).")
+
+
+def _range(array: np.ndarray) -> str:
+    """From where to where an array's numbers go, or that some are none."""
+    return f"{array.min()} to {array.max()}" if np.all(np.isfinite(array)) else "some not finite"
 
 
 def _shown(value: object) -> str:
