@@ -26,7 +26,8 @@ ROOMS = {
     "simulation": {"fields", "models", "recording"},
     "study": {"fields", "models", "recording", "ekf", "gates", "filter", "simulation"},
     "report": {"fields", "models", "recording", "ekf", "gates", "filter", "simulation", "study"},
-    "commands": {"fields", "models", "recording", "ekf", "gates", "filter", "simulation", "study", "report"},
+    "devices": set(),
+    "commands": {"devices", "fields", "models", "recording", "ekf", "gates", "filter", "simulation", "study", "report"},
     "cli": {"filter", "study", "commands"},
     "__main__": {"cli"},
 }

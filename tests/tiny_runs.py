@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
+import pytest
 from quick import QUICK
 
 from vcjax.filter.config import FilterConfig
@@ -15,6 +16,9 @@ from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import Scenario, paper
 from vcjax.simulation.simulate import simulate
 from vcjax.study import monte_carlo as module
+from vcjax.study import reproduce
+from vcjax.study.paper import Cell, cells
+from vcjax.study.reproduce import cell_experiment
 from vcjax.study.results import PER_FEATURE, PER_FRAME, PER_RUN
 from vcjax.study.sweep import Experiment
 
@@ -23,6 +27,8 @@ NUM_SEEDS = 3
 NUM_FRAMES = 12
 NUM_FEATURES = 162
 MOVERS = [21, 23, 30, 32, 102, 104]
+NUM_CELLS = 4
+"""Those that `make_tiny` leaves of the paper's."""
 CAPACITIES = {"max_landmarks": 24, "max_updates": 6}
 MEASURES = (*PER_FRAME, *PER_FEATURE, *PER_RUN, "robot", "is_moving")
 """All that a run is reduced to."""
@@ -61,6 +67,18 @@ def tiny_experiment(experiment: Experiment) -> Experiment:
         dataclasses.replace(experiment.scenario, num_frames=NUM_FRAMES),
         dataclasses.replace(experiment.config, **CAPACITIES),
     )
+
+
+def make_tiny(patch: pytest.MonkeyPatch) -> None:
+    """Make `reproduce` small: only the cells of the robot's forward motion, few frames, and calls of one size."""
+    patch.setattr(reproduce, "cells", some_cells)
+    patch.setattr(reproduce, "cell_experiment", lambda cell: tiny_experiment(cell_experiment(cell)))
+    patch.setattr(module, "LANES_PER_CALL", NUM_SEEDS)
+
+
+def some_cells(tables=(2, 3, 4, 5)) -> list[Cell]:
+    """The cells of Table 2 with the robot's forward motion."""
+    return [cell for cell in cells(tables) if cell.robot_motion == "forward" and cell.dynamic_motion is None]
 
 
 def assert_same_runs(found, expected, **tolerance) -> None:

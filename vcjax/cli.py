@@ -2,13 +2,11 @@
 
 import contextlib
 import io
-import os
 import sys
 import traceback
 from collections.abc import Sequence
 from typing import Annotated
 
-import jax
 import tyro
 from rich.console import Console
 
@@ -27,7 +25,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         command = _parse(arguments)
-        _use_cores(getattr(command, "devices", None))
+        if not isinstance(command, Report):
+            command.devices.start()
         command(console)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         say(console, f"vcjax: {error}", style="bold red")
@@ -86,21 +85,3 @@ def _gate_name(arguments: list[str]) -> str:
         name = value if option == "--gate" else option.removeprefix("--gate=") if option.startswith("--gate=") else ""
         gate = name if name in GATES else gate
     return gate
-
-
-def _use_cores(num_devices: int | None) -> None:
-    """Float64, and as many CPU devices as there are cores: the seeds are shared between them.
-
-    Raises:
-        ValueError: for a number of devices that cannot be had.
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if num_devices is not None and num_devices < 1:
-        raise ValueError(f"--devices {num_devices}: give at least one device.")
-    jax.config.update("jax_enable_x64", True)
-    try:
-        jax.config.update("jax_num_cpu_devices", num_devices or cores)
-    except RuntimeError:  # called from a program in which JAX is at work already: its devices are what there is
-        present = jax.local_device_count()
-        if num_devices not in (None, present):
-            raise ValueError(f"--devices {num_devices}: JAX already runs in this process, with {present}.") from None

@@ -13,6 +13,7 @@ from jaxtyping import PRNGKeyArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from vcjax.devices import Devices
 from vcjax.filter.config import FilterConfig
 from vcjax.report.figures import write_figures
 from vcjax.report.tables import write_tables
@@ -44,20 +45,23 @@ class Reproduce:
     """Directory of the results."""
     key: int = 0
     """Number of the base random key."""
-    devices: int | None = None
-    """CPU devices to share the runs; all cores if not given."""
+    devices: Devices = dataclasses.field(default_factory=Devices)
+    """Where the runs are done."""
 
     def __call__(self, console: Console) -> None:
         """Run, then report."""
         with _progress(console, "compiling, first cell") as show:
-            reproduce(
+            results = reproduce(
                 self.out,
                 num_seeds=self.seeds,
                 tables=self.tables,
                 key=_key(self.key),
                 progress=lambda done, total, cell: show(done, total, f"table {cell.table}, {cell.case}, {cell.method}"),
             )
-        _report(load_results(self.out), self.out, console)
+        if results:
+            _report(load_results(self.out), self.out, console)
+        else:
+            say(console, "finished; other processes are still at work, and the last one writes tables and figures.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,14 +92,16 @@ class Run:
     """Number of the base random key."""
     out: Path = Path("results/run.nc")
     """File of the results (NetCDF-4)."""
-    devices: int | None = None
-    """CPU devices to share the runs; all cores if not given."""
+    devices: Devices = dataclasses.field(default_factory=Devices)
+    """Where the runs are done."""
 
     def __call__(self, console: Console) -> None:
         """Run, summarise, save."""
         check_writable(self.out)
         with _progress(console, "running") as show:
             runs = monte_carlo(self.scenario, self.config, num_seeds=self.seeds, key=_key(self.key), progress=show)
+        if jax.process_index() > 0:  # every process has all the runs
+            return
         print(summarise(runs))
         say(console, f"wrote {save(runs, self.out)}")
 
@@ -113,8 +119,8 @@ class Bench:
     """File for the numbers."""
     baseline: Path | None = None
     """Accepted ratios to compare with, e.g. docs/benchmark.json; exit status 1 where one has become worse."""
-    devices: int | None = None
-    """CPU devices to share the runs; all cores if not given."""
+    devices: Devices = dataclasses.field(default_factory=Devices)
+    """Where the runs are done."""
 
     def __call__(self, console: Console) -> None:
         """Measure, print, save, compare."""

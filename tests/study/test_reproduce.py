@@ -1,39 +1,21 @@
-"""The paper's experiments on disk: stopped, killed, extended, refused; with tiny versions of four cells of Table 2."""
+"""The paper's experiments on disk: stopped, extended, refused; with tiny versions of four cells of Table 2."""
 
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-import tiny_runs
 import xarray as xr
-from tiny_runs import NUM_SEEDS, tiny_experiment
+from tiny_runs import NUM_CELLS, NUM_SEEDS, make_tiny, some_cells, tiny_experiment
 
 import vcjax as vc
 from vcjax.study import monte_carlo as monte_carlo_module
 from vcjax.study import reproduce as module
 from vcjax.study.paper import METHODS, Cell, cells
 from vcjax.study.reproduce import cell_experiment, load_results, reproduce
-
-NUM_CELLS = 4
-
-
-def make_tiny(patch: pytest.MonkeyPatch) -> None:
-    """Only the cells of the robot's forward motion, all of them small, and calls of one size."""
-    patch.setattr(module, "cells", some_cells)
-    patch.setattr(module, "cell_experiment", lambda cell: tiny_experiment(cell_experiment(cell)))
-    patch.setattr(monte_carlo_module, "LANES_PER_CALL", NUM_SEEDS)
-
-
-def some_cells(tables=(2, 3, 4, 5)) -> list[Cell]:
-    return [cell for cell in cells(tables) if cell.robot_motion == "forward" and cell.dynamic_motion is None]
 
 
 @pytest.fixture(autouse=True)
@@ -120,6 +102,7 @@ def test_stopped_and_started_again_ends_the_same(whole, tmp_path, tiny, num_bloc
     leftover = tmp_path / "runs" / last.identifier / ".seeds_00000-00002.nc.x1y2.tmp"
     leftover.parent.mkdir(exist_ok=True)
     leftover.write_bytes(b"half a file")
+    os.utime(leftover, (0, 0))
 
     results = reproduce(tmp_path, num_seeds=NUM_SEEDS, tables=(2,))
     assert_identical(results, whole[1])
@@ -171,6 +154,7 @@ def test_leftovers_are_removed_beside_finished_blocks_and_nothing_else_is(whole,
     leftover, other = cell / ".seeds_00000-00002.nc.x1y2.tmp", cell / ".notes.txt.tmp"
     for path in (leftover, other):
         path.write_bytes(b"half a file")
+        os.utime(path, (0, 0))
     reproduce(tmp_path, num_seeds=NUM_SEEDS, tables=(2,))
     assert not tiny and not leftover.exists() and other.exists()
 
@@ -228,36 +212,3 @@ def test_nothing_to_read_is_told(tmp_path):
     for directory in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(FileNotFoundError, match="run `vcjax reproduce` first"):
             load_results(directory)
-
-
-_CHILD = """
-import sys
-sys.path[:0] = {tests!r}
-import jax
-jax.config.update("jax_enable_x64", True)
-from pytest import MonkeyPatch
-from tiny_runs import NUM_SEEDS
-from vcjax.study import reproduce as module
-from test_reproduce import make_tiny
-make_tiny(MonkeyPatch())
-module.reproduce({directory!r}, num_seeds=NUM_SEEDS, tables=(2,))
-"""
-
-
-@pytest.mark.slow
-def test_killed_and_started_again_ends_the_same(whole, tmp_path, tiny):
-    """SIGKILL, which nothing can prepare for, in a process of its own."""
-    script = _CHILD.format(
-        tests=[str(Path(file).parent) for file in (__file__, tiny_runs.__file__)], directory=str(tmp_path)
-    )
-    child = subprocess.Popen([sys.executable, "-c", script], env=os.environ | {"PYTHONWARNINGS": "ignore"})
-    deadline = time.monotonic() + 600
-    while len(list(tmp_path.rglob("*.nc"))) < 2:
-        assert child.poll() is None and time.monotonic() < deadline
-        time.sleep(0.01)
-    child.send_signal(signal.SIGKILL)
-    assert child.wait() == -signal.SIGKILL
-    num_done = len(list(tmp_path.rglob("*.nc")))
-    assert num_done < NUM_CELLS
-    assert_identical(reproduce(tmp_path, num_seeds=NUM_SEEDS, tables=(2,)), whole[1])
-    assert len(tiny) == NUM_CELLS - num_done

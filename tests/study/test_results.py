@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import json
+import os
 import random
 import shutil
 from functools import cache
@@ -36,6 +37,22 @@ def test_read_back_as_written(tmp_path):
         assert back[name].dtype == variable.dtype or variable.dtype.kind == "U", name
     assert back.attrs == runs().attrs and load_attributes(path) == runs().attrs
     assert [p.name for p in path.parent.iterdir()] == ["runs.nc"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="limits the size of files as POSIX does")
+def test_full_disk_is_told_in_one_line_and_keeps_what_was_there(tmp_path):
+    import resource
+
+    path = save(runs(), tmp_path / "runs.nc")
+    before, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))  # no file can grow larger
+    try:
+        with pytest.raises(OSError, match=r"runs.nc: not written \(.*MiB are free there\); make room") as refusal:
+            save(runs(), path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(refusal.value)
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["runs.nc"]
 
 
 def test_read_whole_so_that_the_file_may_go(tmp_path):

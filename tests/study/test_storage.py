@@ -4,14 +4,21 @@ import errno
 import os
 import stat
 import tempfile
+import time
 
 import pytest
 
-from vcjax.study.storage import check_writable, replacing, write_file
+from vcjax.study.storage import LEFTOVER_AGE_S, check_writable, replacing, write_file
 
 
 def names(folder) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
+
+
+def age(path) -> None:
+    """Make a file as old as one that nobody writes to any more."""
+    then = time.time() - 2 * LEFTOVER_AGE_S
+    os.utime(path, (then, then))
 
 
 def test_writes_and_makes_folders(tmp_path):
@@ -69,8 +76,11 @@ def test_what_a_killed_process_left_is_removed_and_other_files_are_not(tmp_path)
     mine, other = ".note[1].txt.abc123.tmp", ".note1.txt.abc123.tmp"
     for name in (mine, other, "note.tmp"):
         (tmp_path / name).touch()
+        age(tmp_path / name)
+    at_work = ".note[1].txt.def456.tmp"  # written to a moment ago: another process's
+    (tmp_path / at_work).touch()
     write_file(tmp_path / "note[1].txt", b"new")
-    assert names(tmp_path) == sorted([other, "note.tmp", "note[1].txt"])
+    assert names(tmp_path) == sorted([at_work, other, "note.tmp", "note[1].txt"])
 
 
 def test_place_below_a_file_is_refused_in_one_line(tmp_path):

@@ -14,8 +14,9 @@ from numbers import Integral
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, PRNGKeyArray
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from vcjax.fields import require_key, require_kind, require_single
 from vcjax.filter.config import FilterConfig, check_arguments
@@ -27,7 +28,9 @@ from vcjax.study.results import as_dataset, import_xarray
 from vcjax.study.sweep import Experiment, Sweep, check_sweep, replace_at
 
 LANES_PER_CALL = 64
-"""Lanes in one compiled call: what is finished between two reports of progress, and a bound on memory."""
+"""Lanes in one compiled call on CPUs: what is finished between two reports of progress."""
+LANES_PER_ACCELERATOR = 256
+"""Lanes that each accelerator has in one call, at most: a bound on memory."""
 
 
 def monte_carlo(
@@ -54,8 +57,11 @@ def monte_carlo(
         first_seed: number of the first seed; seeds are `first_seed … first_seed + num_seeds - 1`.
         sweep: path of a numeric leaf → values, e.g. `{"config.gate.th1": [6, 9, 12],
             "scenario.oscillation.amplitude_m": [0, 0.05]}`; several paths span a grid.
-        devices: devices to use; all local ones if None.
+        devices: devices to use; all there are if None, those of other processes too (see below).
         progress: called with (lanes done, lanes in all).
+
+    In a program of several processes (`jax.distributed.initialize`), each process makes the same call, works on its
+    own part of the lanes, and returns them all. With `devices=jax.local_devices()` it works alone.
 
     Returns:
         xarray.Dataset with dimensions (*sweep paths, seed, frame or feature); see `results.as_dataset`.
@@ -89,7 +95,7 @@ def _check_arguments(scenario, config, num_seeds: int, first_seed: int, key, dev
         raise ValueError(f"monte_carlo(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
     if not isinstance(first_seed, Integral) or not 0 <= first_seed <= 2**32 - num_seeds:
         raise ValueError(f"monte_carlo(first_seed={first_seed!r}): seeds are whole numbers from 0 to 2**32 - 1.")
-    if devices is not None and (not isinstance(devices, Sequence) or len(devices) == 0):
+    if devices is not None and (not isinstance(devices, Sequence | np.ndarray) or len(devices) == 0):
         raise ValueError(f"monte_carlo(devices={devices!r}): give at least one device in a list, or None for all.")
 
 
@@ -108,27 +114,41 @@ def run_lanes(
         swept: path → value of each lane.
         seeds: seed number of each lane.
         key: base key.
-        devices: devices to use; all local ones if None.
+        devices: devices to use; all there are if None.
         progress: called with (lanes done, lanes in all).
 
     Returns: the metrics of `metrics.run_metrics`, each with the lanes as leading axis.
     """
-    devices = jax.local_devices() if devices is None else list(devices)
+    devices = jax.devices() if devices is None else list(devices)
     mesh = Mesh(np.array(devices), ("lane",))
     total, is_cpu = len(seeds), devices[0].platform == "cpu"
     # On a CPU all calls have one size, whatever is asked for; elsewhere empty places cost: only the last call has any.
-    places = math.ceil((LANES_PER_CALL if is_cpu else min(total, LANES_PER_CALL)) / len(devices))
+    places = math.ceil((LANES_PER_CALL if is_cpu else total) / len(devices))
+    places = places if is_cpu else min(places, LANES_PER_ACCELERATOR)
     done = []
     for first in range(0, total, places * len(devices)):
         new = np.arange(first, min(first + places * len(devices), total))
         lane = _share(new, len(devices), places)
         values = {path: value[lane] for path, value in swept.items()}
-        args = (values, jnp.asarray(seeds[lane], jnp.uint32), jnp.asarray(lane >= 0))
+        args = _spread((values, seeds[lane].astype(np.uint32), lane >= 0), mesh)
         result = _run_lanes(experiment, *args, key, mesh, batch_size=1 if is_cpu else places)
-        done.append({name: np.asarray(value)[lane >= 0] for name, value in result.items()})
+        done.append({name: value[lane >= 0] for name, value in _collect(result).items()})
         if progress is not None:
             progress(first + len(new), total)
     return {name: np.concatenate([part[name] for part in done]) for name in done[0]}
+
+
+def _spread(lanes: PyTree[np.ndarray], mesh: Mesh) -> PyTree[Array]:
+    """Arrays with the lanes as leading axis, each device with its part, whichever process it belongs to."""
+    by_lane = NamedSharding(mesh, PartitionSpec("lane"))
+    return jax.tree.map(lambda a: jax.make_array_from_callback(a.shape, by_lane, lambda part: a[part]), lanes)
+
+
+def _collect(result: dict[str, Array]) -> dict[str, np.ndarray]:
+    """Results of all devices on this host; those of other processes come from there."""
+    if all(value.is_fully_addressable for value in result.values()):
+        return jax.device_get(result)
+    return multihost_utils.process_allgather(result, tiled=True)
 
 
 def _share(lanes: np.ndarray, num_devices: int, places: int) -> np.ndarray:
@@ -142,10 +162,10 @@ def _share(lanes: np.ndarray, num_devices: int, places: int) -> np.ndarray:
 
 
 # On a CPU lanes are what runs in parallel: sharing each small product between threads as well only costs.
-_ONE_THREAD_PER_LANE = {"xla_cpu_multi_thread_eigen": False}
+ONE_THREAD_PER_LANE = {"xla_cpu_multi_thread_eigen": False}
 
 
-@partial(jax.jit, static_argnames=("mesh", "batch_size"), compiler_options=_ONE_THREAD_PER_LANE)
+@partial(jax.jit, static_argnames=("mesh", "batch_size"), compiler_options=ONE_THREAD_PER_LANE)
 def _run_lanes(experiment, swept, seeds, is_there, key, mesh: Mesh, batch_size: int) -> dict[str, Array]:
     def run_lane(lane):
         swept, seed, is_there = lane

@@ -2,7 +2,8 @@
 
 A directory holds, for each cell of Tables 2–5, blocks of `SEEDS_PER_BLOCK` seeds: `runs/<cell>/seeds_00000-00024.nc`.
 What is there is not run again, so a run that was stopped goes on where it was, and a larger number of seeds extends a
-smaller one.
+smaller one. Several processes share the blocks: each runs and writes its own part, and whoever reads the directory
+finds them all.
 """
 
 import json
@@ -14,6 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from jaxtyping import PRNGKeyArray
 
 from vcjax.fields import require_key
@@ -34,6 +36,8 @@ OSCILLATION_AMPLITUDE_M = 0.05
 GATES: Mapping[str, Callable[[], AbstractGate]] = {"RE": ReprojectionError, "VC": VirtualCorrection}
 """The gates by their names in the paper."""
 
+Block = tuple[Cell, int, int]
+"""Cell, first seed and end of the seeds."""
 _BLOCK_NAME = re.compile(r"seeds_(\d{5,})-(\d{5,})\.nc")
 
 
@@ -59,13 +63,15 @@ def reproduce(
     """Run every cell of the paper's tables, and RE with the oscillating camera, which the paper left out.
 
     Args:
-        directory: where results are kept; made if needed. Blocks that are there already are read, not run.
+        directory: where results are kept; made if needed. Blocks that are there already are read, not run. Processes
+            that work together (`jax.distributed.initialize`) need one that all of them see.
         num_seeds: runs per cell, at least 1.
         tables: which of 2, 3, 4, 5.
         key: base key; `jax.random.key(0)` if None.
-        progress: called with (blocks done, blocks in all, cell) after each block.
+        progress: called with (blocks done, blocks in all, cell) after each block that this process has to run.
 
-    Returns: the runs of each cell, an `xarray.Dataset` as from `monte_carlo`.
+    Returns: the runs of each cell, an `xarray.Dataset` as from `monte_carlo`; nothing yet where other processes
+    are still at work on them.
 
     Raises:
         ValueError: for a bad number of seeds or table, or if the directory holds results of other settings (of any
@@ -76,23 +82,20 @@ def reproduce(
         raise ValueError(f"reproduce(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
     if not isinstance(tables, Collection) or not tables:
         raise ValueError(f"reproduce(tables={tables!r}): give at least one of {TABLES}, in a list.")
-    directory, chosen = Path(directory), cells(tables)
-    key = jax.random.key(0) if key is None else key
+    directory, key = Path(directory), jax.random.key(0) if key is None else key
     require_key("reproduce", key)
+    blocks = _all_blocks(tables, num_seeds)
     for cell in cells():
         for _, _, path in _blocks(directory / "runs" / cell.identifier):
             _refuse_other_settings(path, cell_experiment(cell), key)
-    for cell in cells():
         remove_leftovers(directory / "runs" / cell.identifier, "seeds_*.nc")
     write_file(directory / "README.txt", _README.encode())  # also tells at once whether the place can be written
-    blocks = [(first, min(first + SEEDS_PER_BLOCK, num_seeds)) for first in range(0, num_seeds, SEEDS_PER_BLOCK)]
-    # Gate by gate, since each compiles once; the paper's order within.
-    work = [(cell, block) for gate in GATES for cell in chosen if cell.gate == gate for block in blocks]
-    for done, (cell, (first, end)) in enumerate(work, start=1):
+    mine = _my_part(blocks, _missing(directory, blocks))
+    for done, (cell, first, end) in enumerate(mine, start=1):
         _run_block(directory / "runs" / cell.identifier, cell, first, end, key)
         if progress is not None:
-            progress(done, len(work), cell)
-    return load_results(directory, tables=tables, num_seeds=num_seeds)
+            progress(done, len(mine), cell)
+    return {} if _missing(directory, blocks) else load_results(directory, tables=tables, num_seeds=num_seeds)
 
 
 def load_results(
@@ -120,12 +123,34 @@ def load_results(
     return {cell: runs.sel(seed=seeds) for cell, runs in results.items()}
 
 
+def _all_blocks(tables: Collection[int], num_seeds: int) -> list[Block]:
+    """The work: gate by gate, since each compiles once; the paper's order within."""
+    seeds = [(first, min(first + SEEDS_PER_BLOCK, num_seeds)) for first in range(0, num_seeds, SEEDS_PER_BLOCK)]
+    chosen = cells(tables)
+    return [(cell, first, end) for gate in GATES for cell in chosen if cell.gate == gate for first, end in seeds]
+
+
+def _missing(directory: Path, blocks: list[Block]) -> list[Block]:
+    """Those of the blocks that a directory lacks."""
+    there = {cell: list(_blocks(directory / "runs" / cell.identifier)) for cell, _, _ in blocks}
+    return [
+        (cell, first, end)
+        for cell, first, end in blocks
+        if not any(found_first == first and found_end >= end for found_first, found_end, _ in there[cell])
+    ]
+
+
+def _my_part(blocks: list[Block], missing: list[Block]) -> list[Block]:
+    """This process's share of the missing blocks, consecutive ones; process 0 says which are missing."""
+    is_missing = multihost_utils.broadcast_one_to_all(np.array([block in missing for block in blocks]))
+    parts = np.array_split(np.flatnonzero(is_missing), jax.process_count())
+    return [blocks[i] for i in parts[jax.process_index()]]
+
+
 def _run_block(folder: Path, cell: Cell, first: int, end: int, key: PRNGKeyArray) -> None:
-    """Run one block of seeds unless it is there; a shorter one of the same first seed is replaced by the longer."""
-    experiment = cell_experiment(cell)
-    if any(found_first == first and found_end >= end for found_first, found_end, _ in _blocks(folder)):
-        return
-    runs = monte_carlo(experiment.scenario, experiment.config, num_seeds=end - first, first_seed=first, key=key)
+    """Run one block of seeds on this process's devices; a shorter one of the same first seed is replaced."""
+    experiment, seeds = cell_experiment(cell), {"first_seed": first, "num_seeds": end - first}
+    runs = monte_carlo(experiment.scenario, experiment.config, **seeds, key=key, devices=jax.local_devices())
     written = save(runs, folder / f"seeds_{first:05d}-{end - 1:05d}.nc")
     for found_first, _, path in list(_blocks(folder)):
         if found_first == first and path != written:

@@ -7,6 +7,7 @@ single file, which can be written under a temporary name and renamed, so that a 
 import dataclasses
 import json
 import os
+import shutil
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -139,7 +140,14 @@ def save(dataset: Any, path: str | os.PathLike) -> Path:
     """
     compressed = {name: {"zlib": True, "complevel": 4} for name, variable in dataset.items() if variable.ndim}
     with replacing(path) as temporary:
-        dataset.to_netcdf(temporary, engine="netcdf4", encoding=compressed)
+        try:
+            dataset.to_netcdf(temporary, engine="netcdf4", encoding=compressed)
+        except (OSError, RuntimeError) as error:  # the library names a full disk in many ways, none of them so
+            free_mib, cause = shutil.disk_usage(temporary.parent).free / 2**20, getattr(error, "strerror", None)
+            raise OSError(
+                f"{path}: not written ({cause or error}; {free_mib:.1f} MiB are free there); make room and run again: "
+                "what was written before stays."
+            ) from None
     return Path(path)
 
 

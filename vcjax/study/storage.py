@@ -4,8 +4,12 @@ import contextlib
 import glob
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
+
+LEFTOVER_AGE_S = 600.0
+"""No write is silent for so long."""
 
 
 @contextlib.contextmanager
@@ -39,9 +43,14 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path, names: str) -> None:
-    """Remove what processes that were killed while writing files of some names (a pattern) have left in a folder."""
+    """Remove what processes that were killed while writing files of some names (a pattern) have left in a folder.
+
+    A temporary file that was written to in the last `LEFTOVER_AGE_S` may be another process's work, and stays.
+    """
     for leftover in folder.glob(f".{names}.*.tmp"):
-        leftover.unlink(missing_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # another process has removed it, or is done
+            if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
+                leftover.unlink()
 
 
 def write_file(path: str | os.PathLike, content: bytes) -> Path:

@@ -1,0 +1,115 @@
+"""Several processes that work together: the numbers of one, each part written by who ran it, and a death survived."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_runs
+import xarray as xr
+from tiny_runs import NUM_CELLS, NUM_SEEDS, assert_same_runs, make_tiny, run_strict
+
+from vcjax.study.reproduce import load_results, reproduce
+
+ROUNDING = {"rtol": 1e-9, "atol": 1e-10}  # another compilation rounds differently
+
+_SET_UP = f"""
+import sys
+sys.path.insert(0, {str(Path(tiny_runs.__file__).parent)!r})
+number, port, out = int(sys.argv[1]), sys.argv[2], sys.argv[3]
+import jax
+from vcjax.devices import Devices
+Devices(2, True, "127.0.0.1:" + port, 2, number).start()
+assert (jax.process_count(), jax.local_device_count(), jax.device_count()) == (2, 2, 4)
+import tiny_runs
+"""
+_MONTE_CARLO = """
+import numpy as np
+from tiny_runs import MEASURES, run_strict
+runs = run_strict(num_seeds=5)
+np.savez(f"{out}/{number}.npz", seed=runs.seed, **{name: runs[name] for name in MEASURES})
+"""
+_REPRODUCE = """
+import time
+from pytest import MonkeyPatch
+from tiny_runs import make_tiny
+from vcjax.study import reproduce as module
+make_tiny(MonkeyPatch())
+def slowly(done, total, cell):
+    print(number, done, total, flush=True)
+    time.sleep(float(sys.argv[4]))
+results = module.reproduce(out, num_seeds=tiny_runs.NUM_SEEDS, tables=(2,), progress=slowly)
+print(number, "found", len(results), flush=True)
+"""
+
+
+def start_two(script: str, *arguments) -> list[subprocess.Popen]:
+    """Two processes that know of each other through a free port of this machine."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    return [
+        subprocess.Popen(
+            [sys.executable, "-c", _SET_UP + script, str(number), str(port), *map(str, arguments)],
+            env=os.environ | {"PYTHONWARNINGS": "ignore"},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for number in range(2)
+    ]
+
+
+def test_two_processes_give_the_numbers_of_one(tmp_path):
+    """Four devices, five lanes: every process has them all in the end."""
+    for process in start_two(_MONTE_CARLO, tmp_path):
+        process.communicate(timeout=600)
+        assert process.returncode == 0
+    expected = run_strict(num_seeds=5)
+    for number in range(2):
+        with np.load(tmp_path / f"{number}.npz") as found:
+            np.testing.assert_array_equal(found["seed"], expected.seed)
+            assert_same_runs(found, expected, **ROUNDING)
+
+
+@pytest.fixture
+def alone(tmp_path, monkeypatch):
+    """The same work by one process."""
+    make_tiny(monkeypatch)
+    return reproduce(tmp_path / "alone", num_seeds=NUM_SEEDS, tables=(2,))
+
+
+def test_each_process_writes_its_part(tmp_path, alone):
+    processes = start_two(_REPRODUCE, tmp_path, 0)
+    told = [process.communicate(timeout=600)[0].splitlines() for process in processes]
+    assert [process.returncode for process in processes] == [0, 0]
+    for number, lines in enumerate(told):
+        assert [line for line in lines if "found" not in line and line.startswith(f"{number} ")] == [
+            f"{number} 1 2",
+            f"{number} 2 2",
+        ]
+    found = sorted(int(line.split()[-1]) for lines in told for line in lines if "found" in line)
+    assert found[0] in (0, NUM_CELLS) and found[1] == NUM_CELLS  # who ends last finds all
+    results = load_results(tmp_path, tables=(2,))
+    for cell, runs in alone.items():
+        xr.testing.assert_allclose(results[cell], runs, **ROUNDING)
+
+
+def test_a_process_that_dies_leaves_what_is_finished_and_a_restart_completes_it(tmp_path, alone, monkeypatch):
+    processes = start_two(_REPRODUCE, tmp_path, 600)  # after its first block each waits
+    deadline = time.monotonic() + 600
+    while len(list(tmp_path.glob("runs/*/*.nc"))) < 2:
+        assert all(process.poll() is None for process in processes) and time.monotonic() < deadline
+        time.sleep(0.05)
+    for process in processes:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("runs/*/*.nc")}
+    results = reproduce(tmp_path, num_seeds=NUM_SEEDS, tables=(2,))
+    assert {path: path.stat().st_mtime_ns for path in before} == before and len(before) == 2
+    for cell, runs in alone.items():
+        xr.testing.assert_allclose(results[cell], runs, **ROUNDING)
