@@ -31,7 +31,7 @@ QUATERNIONS = slice(3, 7), slice(10, 14)
 @quick_jit
 def correct(config, state, slot, uv_px, is_measured):
     """The frame's corrections on the whole state."""
-    submap, rows = gather(state, slot)
+    state, submap, rows = gather(config, state, slot)
     submap, _ = correct_frame(config, Camera(), submap, uv_px, is_measured)
     return scatter(config, state, submap, slot, rows)
 

@@ -24,7 +24,8 @@ class FilterConfig(eqx.Module):
     """Which landmarks are deleted over time."""
 
     max_landmarks: int = eqx.field(static=True, default=107)
-    """Landmark slots. A full map is reported, and no feature is born until a slot is free."""
+    """Landmark slots. A full map is reported, and no feature is born until a slot is free. The paper's scenarios need
+    94; with a spare one, 108 are 9 tiles of 12 (see `map_covariance`)."""
     max_updates: int = eqx.field(static=True, default=10)
     """Landmarks corrected per frame (Table 1: 10)."""
     births_first_frame: int = eqx.field(static=True, default=10)
@@ -49,7 +50,8 @@ class FilterConfig(eqx.Module):
     """Pass over the part of P in use only, by a loop whose length depends on the map: best where runs go one by one, as
     on a CPU. False passes over all of P at once: best under `vmap`. The numbers are the same."""
     reverse_mode: bool = eqx.field(static=True, default=False)
-    """Make the run differentiable in reverse mode too: loops of fixed length only, `skip_free_slots` has no effect."""
+    """Make the run differentiable in reverse mode, and in that only: loops of fixed length or with a derivative of
+    their own, and √T checkpoints, between which the way back passes through the frames once more."""
     toolbox_parity: bool = eqx.field(static=True, default=False)
     """Use the scalar shortcut for derivatives of unit vectors, as the paper's toolbox does (see `frames.unit`)."""
 

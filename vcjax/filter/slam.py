@@ -5,6 +5,8 @@ formal corrections (8)–(12), the gate's verdict (13) (14), corrections with th
 detector flagged; retirement of what cannot matter any more; births.
 """
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -66,7 +68,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     is_measured = is_searched & (column[slot] >= 0)
     uv_px = frame.uv_px[column[slot]]
 
-    submap, rows = gather(state, slot)
+    state, submap, rows = gather(config, state, slot)
     submap, outcome = correct_frame(config, frame.camera, submap, uv_px, is_measured)
     state = scatter(config, state, submap, slot, rows)
     innovation, verdict = outcome.innovation, outcome.verdict
@@ -222,7 +224,25 @@ def _run(config, recording, key):
     def advance(state, t):
         return step(config, state, recording.frame(t))
 
-    if config.reverse_mode:  # keep each frame's state only, and pass through the frame again on the way back
-        advance = jax.checkpoint(advance)
-    state, rest = jax.lax.scan(advance, state, jnp.arange(1, recording.num_frames))
+    if config.reverse_mode:
+        state, rest = _scan_in_stretches(advance, state, recording.num_frames)
+    else:
+        state, rest = jax.lax.scan(advance, state, jnp.arange(1, recording.num_frames))
     return state, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+
+
+def _scan_in_stretches(advance, state, num_frames: int):
+    """Scan of frames 1 … T - 1 that keeps about √T states for the way back, and passes through each stretch again."""
+    length = math.isqrt(num_frames - 1) + 1
+    num = -(-(num_frames - 1) // length)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(advance, state, 0)[1])
+
+    def advance_or_stay(state, t):  # the last stretch may be longer than what is left
+        return jax.lax.cond(t < num_frames, advance, lambda state, t: (state, nothing), state, t)
+
+    def stretch(state, frames):
+        return jax.lax.scan(advance_or_stay, state, frames)
+
+    frames = jnp.arange(1, 1 + num * length).reshape(num, length)
+    state, infos = jax.lax.scan(jax.checkpoint(stretch), state, frames)
+    return state, jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[: num_frames - 1], infos)

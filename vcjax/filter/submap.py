@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.features import Block
-from vcjax.filter.map_covariance import SLOT, downdate, slot_rows
+from vcjax.filter.map_covariance import SLOT, downdate, read_rows, reversible_downdate, reversible_read_rows
 from vcjax.filter.reparametrisation import AtCorrection, Slots, settle
 from vcjax.filter.state import VEHICLE, FilterState
 from vcjax.models.frames import unit, unit_jacobian
@@ -98,10 +98,13 @@ def block_rows(matrix: Float[Array, "n columns"], j: int | Int[Array, ""]) -> Fl
     return jnp.concatenate([matrix[:VEHICLE], jax.lax.dynamic_slice_in_dim(matrix, first_row(j), SLOT)])
 
 
-def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Array, "K 7 M"]]:
-    """The submap of the chosen slots, and their covariance with all slots."""
+def gather(
+    config: FilterConfig, state: FilterState, slot: Int[Array, " K"]
+) -> tuple[FilterState, Submap, Float[Array, "K 7 M"]]:
+    """The submap of the chosen slots, and their covariance with all slots; the state as it is, to go on with."""
     num_slots, num_chosen = state.track_id.shape[0], slot.shape[0]
-    rows = slot_rows(state.P_mm, slot)
+    P_mm, rows = (reversible_read_rows if config.reverse_mode else read_rows)(state.P_mm, slot)
+    state = eqx.tree_at(lambda s: s.P_mm, state, P_mm)
     P_vc = state.P_vm.reshape(VEHICLE, num_slots, SLOT)[:, slot].reshape(VEHICLE, -1)
     P_cc = rows.reshape(num_chosen * SLOT, num_slots, SLOT)[:, slot].reshape(num_chosen * SLOT, -1)
     P = jnp.block([[state.P_vv, P_vc], [P_vc.T, P_cc]])
@@ -123,7 +126,7 @@ def gather(state: FilterState, slot: Int[Array, " K"]) -> tuple[Submap, Float[Ar
         ),
         is_corrected=jnp.zeros(num_chosen, bool),
     )
-    return submap, rows
+    return state, submap, rows
 
 
 def scatter(
@@ -160,10 +163,10 @@ def scatter(
 
 def _downdate(config: FilterConfig, state: FilterState, U: Float[Array, "K2 M"]) -> Float[Array, "M M"]:
     """P_mm - Uᵀ U, all of it or the part in use; free slots' rows mean nothing."""
-    if config.reverse_mode or not config.skip_free_slots:
+    if not config.skip_free_slots:
         return state.P_mm - U.T @ U
     num_used = jnp.max(jnp.where(state.is_mapped, jnp.arange(1, len(state.is_mapped) + 1), 0))
-    return downdate(state.P_mm, U, num_used)
+    return (reversible_downdate if config.reverse_mode else downdate)(state.P_mm, U, num_used)
 
 
 def normalise(config: FilterConfig, vehicle: Float[Array, "14"]) -> tuple[Float[Array, "14"], Float[Array, "14 14"]]:

@@ -96,7 +96,8 @@ class AbstractGate(eqx.Module):
     def judge(self, candidates: Candidates, model: MeasurementModel) -> Verdict:
         """The verdict on each isolated candidate; false and NaN elsewhere.
 
-        A candidate of which nothing can be said, its errors being NaN, is neither recovered nor dynamic.
+        Not called in frames where nobody is isolated. A candidate of which nothing can be said, its errors being NaN,
+        is neither recovered nor dynamic.
         """
 
 
