@@ -149,8 +149,15 @@ def _my_part(blocks: list[Block], missing: list[Block]) -> list[Block]:
 
 def _run_block(folder: Path, cell: Cell, first: int, end: int, key: PRNGKeyArray) -> None:
     """Run one block of seeds on this process's devices; a shorter one of the same first seed is replaced."""
-    experiment, seeds = cell_experiment(cell), {"first_seed": first, "num_seeds": end - first}
-    runs = monte_carlo(experiment.scenario, experiment.config, **seeds, key=key, devices=jax.local_devices())
+    experiment = cell_experiment(cell)
+    runs = monte_carlo(
+        experiment.scenario,
+        experiment.config,
+        num_seeds=end - first,
+        first_seed=first,
+        key=key,
+        devices=jax.local_devices(),
+    )
     written = save(runs, folder / f"seeds_{first:05d}-{end - 1:05d}.nc")
     for found_first, _, path in list(_blocks(folder)):
         if found_first == first and path != written:
