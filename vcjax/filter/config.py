@@ -12,6 +12,7 @@ import numpy as np
 from vcjax.fields import number, require, require_choice, require_count, require_key, require_kind, require_single
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.inlier_ratio import InlierRatio
+from vcjax.gates.surrogates import SMOOTHINGS, Smoothing
 from vcjax.gates.virtual_correction import VirtualCorrection
 
 
@@ -52,9 +53,15 @@ class FilterConfig(eqx.Module):
     reverse_mode: bool = eqx.field(static=True, default=False)
     """Make the run differentiable in reverse mode, and in that only: loops of fixed length or with a derivative of
     their own, and √T checkpoints, between which the way back passes through the frames once more."""
+    smoothing: Smoothing = eqx.field(static=True, default="hard")
+    """How decisions are made differentiable (see `gates.surrogates`): "hard" not at all; "straight_through" by declared
+    derivatives, with the hard filter's numbers; "soft" by weights in [0, 1] that enter the corrections. What is chosen,
+    born, deleted or turned Euclidean stays a hard decision in all three."""
     toolbox_parity: bool = eqx.field(static=True, default=False)
     """Use the scalar shortcut for derivatives of unit vectors, as the paper's toolbox does (see `frames.unit`)."""
 
+    temperature: float = eqx.field(converter=number, default=1.0)
+    """τ of the smoothing, in χ² units; positive."""
     pixel_std_px: float = eqx.field(converter=number, default=1.0)
     """Standard deviation of a measured pixel, px (Table 1: 1.0); positive."""
     oscillation_std_m: float = eqx.field(converter=number, default=0.0)
@@ -75,7 +82,7 @@ class FilterConfig(eqx.Module):
         require_kind("FilterConfig", "gate", self.gate, AbstractGate, gates)
         detectors = "give a detector, e.g. InlierRatio(), or InlierRatio(min_searches=inf) to delete nothing."
         require_kind("FilterConfig", "detector", self.detector, AbstractDetector, detectors)
-        for name in ("pixel_std_px", "inverse_depth_mean", "inverse_depth_std", "inverse_depth_min"):
+        for name in ("temperature", "pixel_std_px", "inverse_depth_mean", "inverse_depth_std", "inverse_depth_min"):
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
         for name in ("oscillation_std_m", "linearity_max", "birth_margin_px"):
             require(self, name, lambda v: np.isfinite(v) & (v >= 0), "give a number of at least 0.")
@@ -85,11 +92,17 @@ class FilterConfig(eqx.Module):
             require_count(self, name, 0)
         for name, choices in (
             ("update", ("sequential", "stacked")),
+            ("smoothing", SMOOTHINGS),
             ("choose_among", ("predicted", "measured")),
             ("birth_order", ("lowest_id", "random")),
             *((name, (True, False)) for name in ("retire", "skip_free_slots", "reverse_mode", "toolbox_parity")),
         ):
             require_choice(self, name, choices)
+        if self.update == "stacked" and self.smoothing != "hard":
+            raise ValueError(
+                f"FilterConfig(update='stacked', smoothing={self.smoothing!r}): stacked corrections have no smooth "
+                "form; take update='sequential'."
+            )
         if self.max_updates > self.max_landmarks:
             raise ValueError(
                 f"FilterConfig(max_updates={self.max_updates}) exceeds max_landmarks={self.max_landmarks}: "

@@ -33,6 +33,9 @@ class FrameInfo(eqx.Module):
     """Isolated, then corrected with."""
     is_dynamic: Bool[Array, " K"]
     """Isolated, called dynamic by the gate and deleted."""
+    p_dynamic: Float[Array, " K"]
+    """Soft: to what degree a measured candidate is neither accepted nor recovered, in [0, 1]; with hard decisions 1
+    where dynamic, else 0."""
     inconsistent_id: Int[Array, " L"]
     """Features deleted by the detector; -1 elsewhere."""
     born_id: Int[Array, " births"]

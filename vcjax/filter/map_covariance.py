@@ -19,14 +19,15 @@ TILE = SLOT * SLOTS_PER_BLOCK
 """Rows and columns of a tile."""
 
 
-def downdate(P_mm: Float[Array, "M M"], U: Float[Array, "K2 M"], num_used: Int[Array, ""]) -> Float[Array, "M M"]:
-    """P_mm - Uᵀ U in the lower tiles of the first `num_used` slots; the rows of the others mean nothing.
+def downdate(
+    P_mm: Float[Array, "M M"], V: Float[Array, "K2 M"], U: Float[Array, "K2 M"], num_used: Int[Array, ""]
+) -> Float[Array, "M M"]:
+    """P_mm - Vᵀ U, symmetric, in the lower tiles of the first `num_used` slots; the rows of the others mean nothing.
 
     The number of tiles depends on the map: a loop of unknown length, without derivative in reverse mode.
     """
     row, column = _lower_tiles(P_mm)
-    right = _columns_of_blocks(U)
-    left = right.mT
+    left, right = _columns_of_blocks(V).mT, _columns_of_blocks(U)
 
     def downdate_tile(t, P_mm):
         place = (TILE * row[t], TILE * column[t])
@@ -58,25 +59,27 @@ def symmetric(P_mm: Float[Array, "M M"]) -> Float[Array, "M M"]:
 
 
 # The same two operations with derivatives in reverse mode (and in no other) that are as cheap as they are: the downdate
-# needs U and not P_mm for its way back, and the derivative by the rows is added to that by P_mm in place, for which
-# whoever reads rows goes on with the P_mm that was handed back.
+# needs U and V and not P_mm for its way back, and the derivative by the rows is added to that by P_mm in place, for
+# which whoever reads rows goes on with the P_mm that was handed back.
 reversible_downdate = jax.custom_vjp(downdate)
 reversible_read_rows = jax.custom_vjp(read_rows)
 
 
 def _downdate_backward(residuals, P_bar):
-    """Tile (r, c) is P - U_rᵀ U_c: the derivative by P stays, Ū_r = -U_c P̄ᵀ and Ū_c = -U_r P̄."""
-    U, num_used = residuals
+    """Tile (r, c) is P - V_rᵀ U_c: the derivative by P stays, V̄_r = -U_c P̄ᵀ and Ū_c = -V_r P̄."""
+    V, U, num_used = residuals
     row, column = _lower_tiles(P_bar)
-    blocks = _columns_of_blocks(U)
+    left, right = _columns_of_blocks(V), _columns_of_blocks(U)
 
-    def add_tile(t, U_bar):
+    def add_tile(t, bars):
+        V_bar, U_bar = bars
         r, c = row[t], column[t]
         tile = jax.lax.dynamic_slice(P_bar, (TILE * r, TILE * c), (TILE, TILE))
-        return U_bar.at[r].add(-blocks[c] @ tile.T).at[c].add(-blocks[r] @ tile)
+        return V_bar.at[r].add(-right[c] @ tile.T), U_bar.at[c].add(-left[r] @ tile)
 
-    U_bar = jax.lax.fori_loop(0, _num_tiles(num_used), add_tile, jnp.zeros_like(blocks))
-    return P_bar, U_bar.swapaxes(0, 1).reshape(U.shape), None
+    bars = jax.lax.fori_loop(0, _num_tiles(num_used), add_tile, (jnp.zeros_like(left), jnp.zeros_like(right)))
+    V_bar, U_bar = (bar.swapaxes(0, 1).reshape(U.shape) for bar in bars)
+    return P_bar, V_bar, U_bar, None
 
 
 def _read_rows_backward(slot, given):
@@ -93,7 +96,9 @@ def _read_rows_backward(slot, given):
     return jax.lax.fori_loop(0, len(slot), add_slot, P_bar), None
 
 
-reversible_downdate.defvjp(lambda P_mm, U, num_used: (downdate(P_mm, U, num_used), (U, num_used)), _downdate_backward)
+reversible_downdate.defvjp(
+    lambda P_mm, V, U, num_used: (downdate(P_mm, V, U, num_used), (V, U, num_used)), _downdate_backward
+)
 reversible_read_rows.defvjp(lambda P_mm, slot: (read_rows(P_mm, slot), slot), _read_rows_backward)
 
 

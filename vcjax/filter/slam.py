@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, PRNGKeyArray
 from vcjax.fields import require_kind
 from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig, check_arguments
-from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import choose, match, predict_features
+from vcjax.filter.frame_corrections import correct_frame
 from vcjax.filter.info import FrameInfo
 from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state, slot_count
@@ -73,7 +73,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     state = scatter(config, state, submap, slot, rows)
     innovation, verdict = outcome.innovation, outcome.verdict
 
-    is_dynamic = jnp.zeros_like(prediction.is_visible).at[slot].set(verdict.is_dynamic)
+    is_dynamic = jnp.zeros_like(prediction.is_visible).at[slot].set(outcome.is_dynamic)
     is_visible = prediction.is_visible.at[slot].set(
         jnp.where(is_measured, innovation.is_visible, prediction.is_visible[slot])
     )
@@ -81,7 +81,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         slot=slot,
         is_searched=is_searched,
         is_measured=is_measured,
-        is_corrected=outcome.is_accepted | verdict.is_recovered,
+        is_corrected=outcome.is_accepted | outcome.is_recovered,
         re1=innovation.re1,
         is_visible=is_visible & ~is_dynamic,
     )
@@ -99,8 +99,9 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         re1_prior=verdict.re1,
         re2=verdict.re2,
         is_accepted=outcome.is_accepted,
-        is_recovered=verdict.is_recovered,
-        is_dynamic=verdict.is_dynamic,
+        is_recovered=outcome.is_recovered,
+        is_dynamic=outcome.is_dynamic,
+        p_dynamic=outcome.p_dynamic,
         inconsistent_id=jnp.where(is_flagged, state.track_id, FREE),
     )
     is_deleted = is_dynamic | is_flagged
@@ -168,6 +169,7 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
         is_accepted=nobody,
         is_recovered=nobody,
         is_dynamic=nobody,
+        p_dynamic=jnp.zeros(K, dtype),
         inconsistent_id=jnp.full(slot_count(config), FREE, jnp.int32),
     )
     is_mapped = jnp.zeros_like(frame.is_valid)

@@ -12,10 +12,12 @@ With P⁰ the covariance the frame began with, P = P⁰ - U_<jᵀ U_<j in correc
 
 Every u_j is a combination t_j, of only 2 K numbers, of the rows of H P⁰. So at the end of the frame
 
-    U = T H P⁰,    P ← P⁰ - Uᵀ U,    x ← x + Uᵀ w:
+    U = T H P⁰,    P ← P⁰ - Uᵀ D U,    x ← x + Uᵀ w:
 
 the covariance downdate is delayed, gathered in one symmetric rank-2K product, and equals the textbook's sequential full
-updates to rounding error.
+updates to rounding error. In the hard filter D = I and w = W z. A soft correction of weight g has the gain g K, and
+with D = 2 g - g² and w = g W z exactly Joseph's covariance of that gain, P - (2 g - g²) K S Kᵀ, which is positive
+definite for 0 ≤ g ≤ 1.
 """
 
 import equinox as eqx
@@ -45,13 +47,15 @@ class Submap(eqx.Module):
     P: Float[Array, "n n"]
     """P⁰, the covariance the frame began with."""
     U: Float[Array, "M n"]
-    """Rows u_j of the corrections so far, two for each; M = 2 K."""
-    H: Float[Array, "K 2 21"]
+    """Rows u_j of the corrections so far, two for each of C; M = 2 C."""
+    D: Float[Array, " M"] | None
+    """Their weights in P, 2 g - g² for a correction of weight g; None in the hard filter, where they are 1."""
+    H: Float[Array, "C 2 21"]
     """Their measurement derivatives."""
     T: Float[Array, "M M"]
     """The same rows as combinations of the rows of H P⁰."""
     w: Float[Array, " M"]
-    """White innovations W z."""
+    """White innovations, weighted: g W z."""
     at_correction: AtCorrection
     """What was noted of each landmark when it was corrected with (leading axis K)."""
     is_corrected: Bool[Array, " K"]
@@ -84,7 +88,12 @@ def block(submap: Submap, j: int | Int[Array, ""]) -> Block:
 def block_cov(submap: Submap, j: int | Int[Array, ""]) -> Float[Array, "21 21"]:
     """Current covariance of the block of candidate j: vehicle and its slot."""
     U = block_columns(submap.U, j)
-    return block_columns(block_rows(submap.P, j), j) - U.T @ U
+    return block_columns(block_rows(submap.P, j), j) - weighted(submap, U.T) @ U
+
+
+def weighted(submap: Submap, columns: Float[Array, "*n M"]) -> Float[Array, "*n M"]:
+    """Columns, one for each row of U, times D."""
+    return columns if submap.D is None else columns * submap.D
 
 
 def block_columns(matrix: Float[Array, "rows n"], j: int | Int[Array, ""]) -> Float[Array, "rows 21"]:
@@ -103,6 +112,8 @@ def gather(
 ) -> tuple[FilterState, Submap, Float[Array, "K 7 M"]]:
     """The submap of the chosen slots, and their covariance with all slots; the state as it is, to go on with."""
     num_slots, num_chosen = state.track_id.shape[0], slot.shape[0]
+    # A soft filter corrects with every candidate twice: as far as it is accepted, and as far as it is recovered.
+    num_corrections = num_chosen * (2 if config.smoothing == "soft" else 1)
     P_mm, rows = (reversible_read_rows if config.reverse_mode else read_rows)(state.P_mm, slot)
     state = eqx.tree_at(lambda s: s.P_mm, state, P_mm)
     P_vc = state.P_vm.reshape(VEHICLE, num_slots, SLOT)[:, slot].reshape(VEHICLE, -1)
@@ -115,10 +126,11 @@ def gather(
         is_euclidean=state.is_euclidean[slot],
         shift=jnp.zeros(P.shape[0], P.dtype),
         P=P,
-        U=jnp.zeros((2 * num_chosen, P.shape[0]), P.dtype),
-        H=jnp.zeros((num_chosen, 2, VEHICLE + SLOT), P.dtype),
-        T=jnp.zeros((2 * num_chosen, 2 * num_chosen), P.dtype),
-        w=jnp.zeros(2 * num_chosen, P.dtype),
+        U=jnp.zeros((2 * num_corrections, P.shape[0]), P.dtype),
+        D=None if config.smoothing == "hard" else jnp.zeros(2 * num_corrections, P.dtype),
+        H=jnp.zeros((num_corrections, 2, VEHICLE + SLOT), P.dtype),
+        T=jnp.zeros((2 * num_corrections, 2 * num_corrections), P.dtype),
+        w=jnp.zeros(2 * num_corrections, P.dtype),
         at_correction=AtCorrection(
             jnp.zeros((num_chosen, SLOT), P.dtype),
             jnp.zeros(num_chosen, P.dtype),
@@ -138,6 +150,8 @@ def scatter(
     brought to unit length, q/|q|, and P ← N P Nᵀ with N the derivative of that.
     """
     H_v, H_l = submap.H[..., :VEHICLE], submap.H[..., VEHICLE:]
+    if len(H_l) > len(rows):  # two corrections with each
+        rows = jnp.concatenate([rows, rows])
     HP = H_v.reshape(-1, VEHICLE) @ state.P_vm + jnp.einsum("kai,kim->kam", H_l, rows).reshape(len(submap.T), -1)
     U = submap.T @ HP
     shift = (U.T @ submap.w).reshape(-1, SLOT)
@@ -146,6 +160,7 @@ def scatter(
     slots = settle(config, slots, submap.at_correction, submap.is_corrected)
     vehicle, N = normalise(config, vehicle_mean(submap))
     NU_v = N @ submap.U[:, :VEHICLE].T
+    NU_vD, UD = weighted(submap, NU_v), weighted(submap, U.T)
     return eqx.tree_at(
         lambda s: (s.vehicle, s.landmarks, s.to_coordinates, s.is_euclidean, s.P_vv, s.P_vm, s.P_mm),
         state,
@@ -154,19 +169,21 @@ def scatter(
             landmarks.at[slot].set(slots.landmarks),
             state.to_coordinates.at[slot].set(slots.to_coordinates),
             state.is_euclidean.at[slot].set(slots.is_euclidean),
-            N @ state.P_vv @ N.T - NU_v @ NU_v.T,
-            N @ state.P_vm - NU_v @ U,
-            _downdate(config, state, U),
+            N @ state.P_vv @ N.T - NU_vD @ NU_v.T,
+            N @ state.P_vm - NU_vD @ U,
+            _downdate(config, state, UD.T, U),
         ),
     )
 
 
-def _downdate(config: FilterConfig, state: FilterState, U: Float[Array, "K2 M"]) -> Float[Array, "M M"]:
-    """P_mm - Uᵀ U, all of it or the part in use; free slots' rows mean nothing."""
+def _downdate(
+    config: FilterConfig, state: FilterState, DU: Float[Array, "K2 M"], U: Float[Array, "K2 M"]
+) -> Float[Array, "M M"]:
+    """P_mm - Uᵀ D U, all of it or the part in use; free slots' rows mean nothing."""
     if not config.skip_free_slots:
-        return state.P_mm - U.T @ U
+        return state.P_mm - DU.T @ U
     num_used = jnp.max(jnp.where(state.is_mapped, jnp.arange(1, len(state.is_mapped) + 1), 0))
-    return (reversible_downdate if config.reverse_mode else downdate)(state.P_mm, U, num_used)
+    return (reversible_downdate if config.reverse_mode else downdate)(state.P_mm, DU, U, num_used)
 
 
 def normalise(config: FilterConfig, vehicle: Float[Array, "14"]) -> tuple[Float[Array, "14"], Float[Array, "14 14"]]:

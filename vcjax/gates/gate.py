@@ -1,8 +1,10 @@
 """The two contracts of feature rejection: an update gate and a detector.
 
-A **gate** decides within one frame which measurements correct the state: it accepts a candidate by its RE₁, and passes
-a verdict on those it did not accept, each with its own 21-block of robot, sensor and landmark. A **detector** watches
-landmark slots over many frames, keeps a state for each, and flags the ones to delete. The two combine freely.
+A **gate** says within one frame which measurements correct the state: it accepts a candidate by its RE₁, and passes a
+verdict on those it did not accept, each with its own 21-block of robot, sensor and landmark. It says so by margins, how
+far a number lies from its threshold, which `gates.surrogates` turns into decisions, hard or soft. A **detector**
+watches landmark slots over many frames, keeps a state for each, and flags the ones to delete. The two combine
+freely.
 
 A new gate or detector is one new file with one small class. All methods are pure, masked and batched; what is not a
 candidate must neither change a result nor a gradient.
@@ -42,7 +44,8 @@ class Candidates(eqx.Module):
     R: Float[Array, "2 2"]
     """Pixel noise covariance W, px²."""
     is_isolated: Bool[Array, " K"]
-    """Measured but not accepted: the candidates to judge. The others' numbers mean nothing."""
+    """Measured but not accepted: the candidates to judge. The others' numbers mean nothing. With smoothing all that are
+    measured are isolated to a degree, and are judged."""
 
 
 def harmless(candidates: Candidates) -> Candidates:
@@ -70,14 +73,23 @@ def harmless(candidates: Candidates) -> Candidates:
 class Verdict(eqx.Module):
     """What a gate says of the isolated candidates."""
 
-    is_recovered: Bool[Array, " K"]
-    """To be corrected with after all."""
-    is_dynamic: Bool[Array, " K"]
-    """Moving: its landmark is deleted at once."""
+    margin: Float[Array, " K"]
+    """By how much a candidate is dynamic, in χ² units: recovered where at most 0, dynamic where above; NaN, neither,
+    where not judged or where nothing can be said."""
     re1: Float[Array, " K"]
     """RE₁ at the gate's prior (13); NaN where not judged."""
     re2: Float[Array, " K"]
     """RE₂ after the virtual correction (14); NaN where not judged."""
+
+    @property
+    def is_recovered(self) -> Bool[Array, " K"]:
+        """To be corrected with after all."""
+        return self.margin <= 0
+
+    @property
+    def is_dynamic(self) -> Bool[Array, " K"]:
+        """Moving: its landmark is deleted at once."""
+        return self.margin > 0
 
 
 class AbstractGate(eqx.Module):
@@ -89,15 +101,20 @@ class AbstractGate(eqx.Module):
     printed."""
 
     @abstractmethod
+    def margin(self, re1: Float[Array, "..."]) -> Float[Array, "..."]:
+        """By how much a measurement with this squared Mahalanobis distance is accepted, in χ² units: where above 0."""
+
     def accepts(self, re1: Float[Array, "..."]) -> Bool[Array, "..."]:
         """Whether a measurement with this squared Mahalanobis distance corrects the state directly."""
+        return self.margin(re1) > 0
 
     @abstractmethod
     def judge(self, candidates: Candidates, model: MeasurementModel) -> Verdict:
-        """The verdict on each isolated candidate; false and NaN elsewhere.
+        """The verdict on each isolated candidate; NaN elsewhere.
 
         Not called in frames where nobody is isolated. A candidate of which nothing can be said, its errors being NaN,
-        is neither recovered nor dynamic.
+        is neither recovered nor dynamic. Margins have exact derivatives; what they decide is smoothed, or not, by
+        `gates.surrogates`.
         """
 
 

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from vcjax.fields import number, require, require_choice
 from vcjax.gates.gate import PRIORS, AbstractGate, Candidates, MeasurementModel, Prior, Verdict
@@ -12,7 +12,7 @@ from vcjax.gates.gate import PRIORS, AbstractGate, Candidates, MeasurementModel,
 class ReprojectionError(AbstractGate):
     """Accept where RE₁ = zᵀ Z⁻¹ z < Th₁; leave the rest unused. Deletion is the detector's work.
 
-    Its decisions have zero derivative by everything, Th₁ included.
+    Its margin has an exact derivative.
     """
 
     th1: float = eqx.field(converter=number, default=9.0)
@@ -24,13 +24,12 @@ class ReprojectionError(AbstractGate):
         require(self, "th1", lambda th: th > 0, "a threshold on a squared distance is positive (9.0 is 98.9 %).")
         require_choice(self, "prior", PRIORS)
 
-    def accepts(self, re1: Float[Array, "..."]) -> Bool[Array, "..."]:
-        """RE₁ < Th₁."""
-        return re1 < self.th1
+    def margin(self, re1: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Th₁ - RE₁."""
+        return self.th1 - re1
 
     def judge(self, candidates: Candidates, model: MeasurementModel) -> Verdict:
         """No candidate is recovered, none called dynamic."""
         del model
-        nobody = jnp.zeros_like(candidates.is_isolated)
-        nothing = jnp.full(nobody.shape, np.nan, candidates.P.dtype)
-        return Verdict(is_recovered=nobody, is_dynamic=nobody, re1=nothing, re2=nothing)
+        nothing = jnp.full(candidates.is_isolated.shape, np.nan, candidates.P.dtype)
+        return Verdict(margin=nothing, re1=nothing, re2=nothing)

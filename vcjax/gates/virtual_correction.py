@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from vcjax.ekf import correct, innovation_cov, mahalanobis
 from vcjax.fields import number, require, require_choice
@@ -29,7 +29,7 @@ from vcjax.gates.gate import PRIORS, AbstractGate, Candidates, MeasurementModel,
 class VirtualCorrection(AbstractGate):
     """Accept where RE₁ < Th₁; of the rest, recover where RE₁ - RE₂ ≤ Th₂ and call the others dynamic.
 
-    Its decisions have zero derivative by everything, Th₁ and Th₂ included; RE₁ and RE₂ have exact ones.
+    Its margins are Th₁ - RE₁ and RE₁ - RE₂ - Th₂, with exact derivatives.
     """
 
     th1: float = eqx.field(converter=number, default=9.0)
@@ -44,9 +44,9 @@ class VirtualCorrection(AbstractGate):
         require(self, "th2", lambda th: th >= 0, "a threshold on a fall of squared distance is at least 0.")
         require_choice(self, "prior", PRIORS)
 
-    def accepts(self, re1: Float[Array, "..."]) -> Bool[Array, "..."]:
-        """RE₁ < Th₁."""
-        return re1 < self.th1
+    def margin(self, re1: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Th₁ - RE₁."""
+        return self.th1 - re1
 
     def judge(self, candidates: Candidates, model: MeasurementModel) -> Verdict:
         """RE₁ and RE₂ of every isolated candidate on its own virtual copy, and what they say."""
@@ -56,13 +56,8 @@ class VirtualCorrection(AbstractGate):
 
         is_isolated, candidates = candidates.is_isolated, harmless(candidates)
         re1, re2 = jax.vmap(errors)(candidates.mean, candidates.P, candidates.uv_px)
-        fall = re1 - re2  # NaN, of which nothing can be said, is neither recovered nor dynamic
-        return Verdict(
-            is_recovered=is_isolated & (fall <= self.th2),
-            is_dynamic=is_isolated & (fall > self.th2),
-            re1=jnp.where(is_isolated, re1, np.nan),
-            re2=jnp.where(is_isolated, re2, np.nan),
-        )
+        margin, re1, re2 = (jnp.where(is_isolated, value, np.nan) for value in (re1 - re2 - self.th2, re1, re2))
+        return Verdict(margin, re1, re2)
 
 
 def virtual_correction(
