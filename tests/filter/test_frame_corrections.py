@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from filter_runs import CAPACITY, filtered, head, quick_jit, recorded
 
+from vcjax.fields import number
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.correction import correct_frame
 from vcjax.filter.features import Block, observe, predict_features
+from vcjax.filter.frame_corrections import correct_frame
 from vcjax.filter.map_covariance import symmetric
 from vcjax.filter.state import SLOT, VEHICLE
 from vcjax.filter.submap import gather, scatter
+from vcjax.gates.gate import AbstractGate, Prior, Verdict
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.models.camera import Camera
 
@@ -96,6 +98,32 @@ def dense_update(state, z, H):
     return with_cov(state, P - gain @ Z @ gain.T)
 
 
+class FixedWeight(AbstractGate):
+    """Accepts everything to the same degree, whatever its error, and recovers nothing."""
+
+    weight: float = eqx.field(converter=number)
+    prior: Prior = eqx.field(static=True, default="corrected")
+
+    def margin(self, re1):
+        return jnp.log(self.weight / (1.0 - self.weight)) + 0.0 * re1
+
+    def judge(self, candidates, model):
+        nothing = jnp.full(candidates.is_isolated.shape, jnp.nan)
+        return Verdict(nothing, nothing, nothing)
+
+
+def dense_soft_update(state, z, H, g):
+    """x + g K z and Joseph's covariance of the gain g K, (I - g K H) P (I - g K H)ᵀ + g² K R Kᵀ."""
+    P, R = dense_cov(state), SEQUENTIAL.pixel_std_px**2 * np.eye(len(z))
+    gain = g * P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    shift, left = gain @ z, np.eye(len(P)) - gain @ H
+    moved = np.einsum("lij,lj->li", state.to_coordinates, shift[VEHICLE:].reshape(-1, SLOT))
+    state = eqx.tree_at(
+        lambda s: (s.vehicle, s.landmarks), state, (state.vehicle + shift[:VEHICLE], state.landmarks + moved)
+    )
+    return with_cov(state, left @ P @ left.T + gain @ R @ gain.T)
+
+
 def dense_normalise(state):
     """Both quaternions q/|q|, with P by the derivative of that."""
     vehicle, P = np.array(state.vehicle), dense_cov(state)
@@ -128,6 +156,18 @@ def test_sequential_corrections_are_dense_updates_one_after_another(problem):
     corrected = correct(SEQUENTIAL, state, slot, uv_px, is_measured)
     assert_same(corrected, dense_normalise(expected))
     assert np.abs(corrected.vehicle - state.vehicle).max() > 1e-4  # something happened
+
+
+@pytest.mark.parametrize("weight", [1e-9, 0.02, 0.5, 0.98])
+def test_soft_corrections_are_joseph_updates_of_a_smaller_gain(problem, weight):
+    """Whatever the gain, Joseph's form is positive semi-definite, and so is P - (2 g - g²) K S Kᵀ."""
+    state, slot, uv_px = problem
+    is_measured = np.arange(K) % 4 != 3
+    expected = state
+    for j in np.flatnonzero(is_measured):
+        expected = dense_soft_update(expected, *dense_innovation(expected, slot[j], uv_px[j]), weight)
+    config = FilterConfig(**CHOICES | dict(gate=FixedWeight(weight), smoothing="soft"))
+    assert_same(correct(config, state, slot, uv_px, is_measured), dense_normalise(expected))
 
 
 def test_skipping_free_slots_changes_nothing(problem):

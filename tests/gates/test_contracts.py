@@ -23,14 +23,17 @@ class PixelDistance(AbstractGate):
     max_px: float = eqx.field(converter=number, default=5.0)
     prior: Prior = eqx.field(static=True, default="predicted")
 
-    def accepts(self, re1):
-        return re1 < 9.0
+    def margin(self, re1):
+        return 9.0 - re1
 
     def judge(self, candidates, model):
         e_hat, _ = jax.vmap(model.observe)(candidates.mean)
-        is_far = jnp.sum((candidates.uv_px - e_hat) ** 2, axis=1) > self.max_px**2
-        isolated, nothing = candidates.is_isolated, jnp.full(is_far.shape, jnp.nan)
-        return Verdict(isolated & ~is_far, isolated & is_far, nothing, nothing)
+        squared = jnp.sum((candidates.uv_px - e_hat) ** 2, axis=1)
+        margin, nothing = (
+            jnp.where(candidates.is_isolated, squared - self.max_px**2, jnp.nan),
+            jnp.full(squared.shape, jnp.nan),
+        )
+        return Verdict(margin, nothing, nothing)
 
 
 class Cusum(AbstractDetector):
@@ -91,8 +94,8 @@ def test_an_unfinished_class_cannot_be_built():
     class NoJudge(AbstractGate):
         prior: Prior = "corrected"
 
-        def accepts(self, re1):
-            return re1 < 9.0
+        def margin(self, re1):
+            return 9.0 - re1
 
     class NoMemory(AbstractDetector):
         def observe(self, state, evidence):
