@@ -1,0 +1,164 @@
+"""What a setting of gate and camera costs in one run: small smooth functions of its info and truth, to add as you like.
+
+All are finite with finite derivatives for every run that is, whatever was seen, and follow the smoothing of the run
+they are taken of (see `gates.surrogates`): a true gradient of a soft run, a declared one of a straight-through run,
+none through the verdicts of a hard run. `p` is the degree p_dynamic to which a candidate of a frame is called dynamic;
+of a track, seen in several frames, it is 1 - Π (1 - p): called so at least once.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from vcjax.fields import number, require
+from vcjax.filter.info import FrameInfo
+from vcjax.recording import Truth
+from vcjax.simulation.scenarios import Scenario
+from vcjax.study.metrics import trajectory_errors
+
+_CLOSEST = 1e-9
+"""How near a degree may come to 0 or 1 before its logarithm is cut off."""
+
+
+class Labelled(NamedTuple):
+    """Degrees in [0, 1] beside what they should be."""
+
+    p: Float[Array, "*n"]
+    is_mover: Bool[Array, "*n"]
+    counts: Bool[Array, "*n"]
+    """Which of the entries there are."""
+
+
+def candidates(info: FrameInfo, truth: Truth) -> Labelled:
+    """Every measured candidate of every frame, (T, K)."""
+    counts = info.is_measured & (info.candidate_id >= 0)
+    is_mover = truth.is_moving[jnp.where(counts, info.candidate_id, 0)] & counts
+    return Labelled(jnp.where(counts, info.p_dynamic, 0.0), is_mover, counts)
+
+
+def tracks(info: FrameInfo, truth: Truth) -> Labelled:
+    """Every feature that was a measured candidate at least once, (F,): p = 1 - Π (1 - p of its frames)."""
+    each, num_features = candidates(info, truth), truth.is_moving.shape[0]
+    place = jnp.where(each.counts, info.candidate_id, num_features).ravel()
+    log_not = jnp.log1p(-jnp.minimum(each.p, 1.0 - _CLOSEST)).ravel()
+    total = jnp.zeros(num_features, log_not.dtype).at[place].add(log_not, mode="drop")
+    counts = jnp.zeros(num_features, bool).at[place].set(True, mode="drop")
+    return Labelled(-jnp.expm1(total), truth.is_moving & counts, counts)
+
+
+def f1_loss(labelled: Labelled) -> Float[Array, ""]:
+    """1 - F1 with soft counts: F1 = 2 TP / (2 TP + FP + FN), TP = Σ p of movers, FP = Σ p of the others.
+
+    Between 0 and 1; 1 where there are no movers.
+    """
+    num_movers = jnp.sum(labelled.is_mover)
+    called = jnp.sum(jnp.where(labelled.counts, labelled.p, 0.0))
+    hits = jnp.sum(jnp.where(labelled.is_mover, labelled.p, 0.0))
+    total = called + num_movers
+    return 1.0 - 2.0 * hits / jnp.where(total > 0, total, 1.0)
+
+
+def cross_entropy(labelled: Labelled, mover_weight: float | Float[Array, ""] = 1.0) -> Float[Array, ""]:
+    """Weighted binary cross entropy, -(Σ w ln p of movers + Σ ln(1 - p) of the others) / Σ w; 0 where there is nobody.
+
+    Args:
+        labelled: candidates or tracks.
+        mover_weight: w of a mover; the others have 1. Positive.
+    """
+    p = jnp.clip(labelled.p, _CLOSEST, 1.0 - _CLOSEST)
+    weight = jnp.where(labelled.is_mover, mover_weight, 1.0) * labelled.counts
+    total = jnp.sum(weight)
+    log_likelihood = jnp.where(labelled.is_mover, jnp.log(p), jnp.log1p(-p))
+    return -jnp.sum(weight * log_likelihood) / jnp.where(total > 0, total, 1.0)
+
+
+def ranking_loss(labelled: Labelled, temperature: float | Float[Array, ""] = 1.0) -> Float[Array, ""]:
+    """1 - soft AUC: mean over pairs of a mover m and another o of σ((s_o - s_m)/τ), with the log-odds s = ln p/(1 - p).
+
+    For τ → 0 the share of pairs in the wrong order. 0.5 where all have the same p; 0 where there are no pairs.
+
+    Args:
+        labelled: tracks, or candidates of one frame: all pairs are formed.
+        temperature: τ of the order, in log-odds; positive.
+    """
+    p = jnp.clip(labelled.p, _CLOSEST, 1.0 - _CLOSEST)
+    odds = (jnp.log(p) - jnp.log1p(-p)).ravel()
+    is_mover = labelled.is_mover.ravel()
+    is_other = labelled.counts.ravel() & ~is_mover
+    is_pair = is_mover[:, None] & is_other
+    wrong = jax.nn.sigmoid((odds[None, :] - odds[:, None]) / temperature)
+    num_pairs = jnp.sum(is_pair)
+    return jnp.sum(jnp.where(is_pair, wrong, 0.0)) / jnp.where(num_pairs > 0, num_pairs, 1)
+
+
+def position_rmse_m(info: FrameInfo, truth: Truth) -> Float[Array, ""]:
+    """RMS over the frames of √(ex² + ey²), m; its derivative is zero where there is no error at all."""
+    mean_square = jnp.mean(jnp.sum((info.vehicle[:, :2] - truth.robot[:, :2]) ** 2, axis=1))
+    is_none = mean_square <= 0
+    return jnp.where(is_none, 0.0, jnp.sqrt(jnp.where(is_none, 1.0, mean_square)))
+
+
+def inconsistency(info: FrameInfo, truth: Truth) -> Float[Array, ""]:
+    """(ln ANEES)² of the position (x, y), 0 for a run whose covariance has the size of its error.
+
+    Frames without a defined NEES (see `metrics.trajectory_errors`) are left out; 0 where no frame has one.
+    """
+    nees = trajectory_errors(info, truth)["nees_position"]
+    is_defined = ~jnp.isnan(nees)
+    num = jnp.sum(is_defined)
+    anees = jnp.sum(jnp.where(is_defined, nees, 0.0)) / (2 * jnp.where(num > 0, num, 1))
+    return jnp.where(anees > 0, jnp.log(jnp.where(anees > 0, anees, 1.0)) ** 2, 0.0)
+
+
+def camera_motion_m2_s2(scenario: Scenario) -> Float[Array, ""]:
+    """Price of the oscillation: its mean square speed (2 π f A)² / 2, m²/s². ∝ A² f²."""
+    A, f = scenario.oscillation.amplitude_m, scenario.oscillation.frequency_hz
+    return 0.5 * (2.0 * jnp.pi * jnp.asarray(f) * A) ** 2
+
+
+class Objective(eqx.Module):
+    """What is wanted of a setting: a weighted sum of the losses of this module. All weights are at least 0."""
+
+    track_f1: float = eqx.field(converter=number, default=1.0)
+    """Of `f1_loss` of the tracks."""
+    track_cross_entropy: float = eqx.field(converter=number, default=0.0)
+    """Of `cross_entropy` of the tracks."""
+    track_ranking: float = eqx.field(converter=number, default=0.0)
+    """Of `ranking_loss` of the tracks."""
+    candidate_f1: float = eqx.field(converter=number, default=0.0)
+    """Of `f1_loss` of the candidates of all frames."""
+    candidate_cross_entropy: float = eqx.field(converter=number, default=0.0)
+    """Of `cross_entropy` of the candidates."""
+    position: float = eqx.field(converter=number, default=0.0)
+    """Of `position_rmse_m`, 1/m."""
+    consistency: float = eqx.field(converter=number, default=0.0)
+    """Of `inconsistency`."""
+    camera_motion: float = eqx.field(converter=number, default=0.0)
+    """Of `camera_motion_m2_s2`, s²/m²."""
+
+    def __check_init__(self):
+        for name in vars(self):
+            require(self, name, lambda w: np.isfinite(w) & (w >= 0), "a weight is at least 0.")
+
+    def terms(self, scenario: Scenario, info: FrameInfo, truth: Truth) -> dict[str, Float[Array, ""]]:
+        """The losses by the names of their weights, not weighted."""
+        of_tracks, of_candidates = tracks(info, truth), candidates(info, truth)
+        return {
+            "track_f1": f1_loss(of_tracks),
+            "track_cross_entropy": cross_entropy(of_tracks),
+            "track_ranking": ranking_loss(of_tracks),
+            "candidate_f1": f1_loss(of_candidates),
+            "candidate_cross_entropy": cross_entropy(of_candidates),
+            "position": position_rmse_m(info, truth),
+            "consistency": inconsistency(info, truth),
+            "camera_motion": camera_motion_m2_s2(scenario),
+        }
+
+    def __call__(self, scenario: Scenario, info: FrameInfo, truth: Truth) -> Float[Array, ""]:
+        """The weighted sum of one run."""
+        terms = self.terms(scenario, info, truth)
+        return sum((getattr(self, name) * value for name, value in terms.items()), jnp.zeros(()))
