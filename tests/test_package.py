@@ -15,18 +15,19 @@ import vcjax
 PACKAGE = Path(vcjax.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# Imports run one way: a room may use those named here and itself, and no other. `fields` is below everything.
+# Imports run one way: a room may use those named here and itself, and no other. The first two are below everything.
 ROOMS = {
     "fields": set(),
+    "storage": set(),
     "models": {"fields"},
     "recording": {"fields", "models"},
     "ekf": {"fields", "models"},
     "gates": {"fields", "models", "recording", "ekf"},
     "filter": {"fields", "models", "recording", "ekf", "gates"},
     "simulation": {"fields", "models", "recording"},
-    "study": {"fields", "models", "recording", "ekf", "gates", "filter", "simulation"},
-    "report": {"fields", "models", "recording", "ekf", "gates", "filter", "simulation", "study"},
-    "commands": {"fields", "models", "recording", "ekf", "gates", "filter", "simulation", "study", "report"},
+    "study": {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation"},
+    "report": {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation", "study"},
+    "commands": {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation", "study", "report"},
     "cli": {"filter", "study", "commands"},
     "__main__": {"cli"},
 }

@@ -7,7 +7,7 @@ import tempfile
 
 import pytest
 
-from vcjax.study.storage import check_writable, replacing, write_file
+from vcjax.storage import check_writable, replacing, write_file
 
 
 def names(folder) -> list[str]:
