@@ -25,6 +25,7 @@ ROOMS = {
     "gates": {"fields", "models", "recording", "ekf"},
     "filter": {"fields", "models", "recording", "ekf", "gates"},
     "simulation": {"fields", "models", "recording"},
+    "sources": {"fields", "storage", "models", "recording", "simulation"},
     "study": {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation"},
     "report": {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation", "study"},
     "commands": {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation", "study", "report"},
