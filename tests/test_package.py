@@ -141,7 +141,7 @@ def test_core_needs_no_optional_package():
     told = run_alone(
         """
 import sys
-optional = ["xarray", "netCDF4", "matplotlib", "rich", "scipy.stats", "tyro"]
+optional = ["xarray", "netCDF4", "matplotlib", "rich", "scipy.stats", "tyro", "cv2", "pyarrow", "yaml", "PIL"]
 sys.modules.update(dict.fromkeys(optional))  # an attempt to import any of them fails
 import jax
 import vcjax

@@ -70,7 +70,7 @@ class Calibration:
         for name in ("fx", "fy", "cx", "cy"):
             _require(self, name, _is_number(getattr(self, name)), "give a finite number of pixels.")
         for name in ("fx", "fy"):
-            _require(self, name, getattr(self, name) > 0, "a focal length is positive.")
+            _require(self, name, bool(getattr(self, name) > 0), "a focal length is positive.")
         for name in ("fx", "fy", "cx", "cy"):
             object.__setattr__(self, name, float(getattr(self, name)))
         is_known = isinstance(self.distortion_model, str) and self.distortion_model in NUM_COEFFICIENTS
