@@ -9,7 +9,15 @@ from scipy.linalg import expm
 
 from vcjax.models.frames import rotation_matrix
 from vcjax.models.motion import move_by_odometry
-from vcjax.sources.odometry import AXES, from_poses, from_velocities, read_odometry, unknown_motion
+from vcjax.sources.odometry import (
+    AXES,
+    Odometry,
+    from_poses,
+    from_velocities,
+    read_odometry,
+    unknown_motion,
+    write_odometry,
+)
 from vcjax.sources.table_file import write_table
 
 
@@ -137,7 +145,21 @@ def test_table_with_covariance(tmp_path):
     np.testing.assert_allclose(found.cov, cov[[1, 2, 0]], rtol=1e-15)
 
 
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_table_there_and_back(tmp_path_factory, seed, is_shifted):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(3, 6, 6))
+    odometry = Odometry(rng.normal(size=(3, 6)), A + A.mT, rng.normal(size=(3, 3)) if is_shifted else None)
+    path = write_odometry(tmp_path_factory.mktemp("odometry") / "o.csv", odometry, FRAMES)
+    found = read_odometry(path, FRAMES)
+    assert found.increment.tobytes() == odometry.increment.tobytes() and found.cov.tobytes() == odometry.cov.tobytes()
+    assert (found.sensor_shift_m is None) == (not is_shifted)
+    if is_shifted:
+        assert found.sensor_shift_m.tobytes() == odometry.sensor_shift_m.tobytes()
+
+
 BAD_TABLES = {
+    "half a shift": ({"shift_y": np.zeros(3)}, "1 of shift_x, shift_y, shift_z; give all three or none"),
     "no uncertainty": ({f"std_{axis}": None for axis in AXES}, "0 of 6 standard deviations .* and 0 of 21"),
     "five of six": ({"std_ry": None}, "5 of 6 standard deviations"),
     "two kinds": ({"cov_dx_dx": np.ones(3)}, "6 of 6 standard deviations .* and 1 of 21"),

@@ -6,13 +6,15 @@ the start is the first image, it is zero and certain.
 """
 
 import os
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from vcjax.sources.table_file import Kind, read_table
+from vcjax.sources.table_file import Kind, read_table, write_table
 
+SHIFTS = ("shift_x", "shift_y", "shift_z")
 AXES = ("dx", "dy", "dz", "rx", "ry", "rz")
 
 Vector = Float[np.ndarray, "T 3"]
@@ -25,6 +27,8 @@ class Odometry(NamedTuple):
     """Δposition (m), Δrotation vector (rad), in the robot frame of the frame before."""
     cov: Float[np.ndarray, "T 6 6"]
     """Their covariance."""
+    sensor_shift_m: Float[np.ndarray, "T 3"] | None = None
+    """Commanded displacement of the camera in the robot frame since the frame before, m; None: it is fixed."""
 
 
 def read_odometry(path: str | os.PathLike, frames: Int[np.ndarray, " T"]) -> Odometry:
@@ -32,7 +36,8 @@ def read_odometry(path: str | os.PathLike, frames: Int[np.ndarray, " T"]) -> Odo
 
     Its columns are `frame`, the increment `dx, dy, dz` (m) and `rx, ry, rz` (rad), and its uncertainty: standard
     deviations `std_dx … std_rz`, or the covariance `cov_dx_dx, cov_dx_dy … cov_rz_rz` (its 21 elements with the first
-    name before or equal to the second in that order).
+    name before or equal to the second in that order). Where the camera is moved on the robot, `shift_x, shift_y,
+    shift_z` (m) say how far since the frame before.
 
     Args:
         path: a `.csv` or `.parquet` file.
@@ -46,14 +51,17 @@ def read_odometry(path: str | os.PathLike, frames: Int[np.ndarray, " T"]) -> Odo
     stds = [f"std_{axis}" for axis in AXES]
     covs = [f"cov_{AXES[i]}_{AXES[j]}" for i, j in pairs]
     kinds: dict[str, Kind] = {"frame": "whole"}
-    kinds.update(dict.fromkeys([*AXES, *stds, *covs], "real"))
-    table = read_table(path, kinds, optional=[*stds, *covs])
+    kinds.update(dict.fromkeys([*AXES, *stds, *covs, *SHIFTS], "real"))
+    table = read_table(path, kinds, optional=[*stds, *covs, *SHIFTS])
     given = {"std": [n for n in stds if n in table.columns], "cov": [n for n in covs if n in table.columns]}
     if len(given["std"]) not in (0, 6) or len(given["cov"]) not in (0, 21) or bool(given["std"]) == bool(given["cov"]):
         raise ValueError(
             f"{path}: {len(given['std'])} of 6 standard deviations std_dx … std_rz and {len(given['cov'])} of 21 "
             "elements of a covariance cov_dx_dx … cov_rz_rz; give all of one kind and none of the other."
         )
+    shifts = [table[name] for name in SHIFTS if name in table.columns]
+    if len(shifts) not in (0, 3):
+        raise ValueError(f"{path}: {len(shifts)} of shift_x, shift_y, shift_z; give all three or none.")
     place = np.searchsorted(frames, table["frame"]).clip(max=len(frames) - 1)
     table.refuse_where(frames[place] != table["frame"], "frame", "is no frame of the recording")
     first = np.full(len(frames), table.num_rows)
@@ -69,7 +77,24 @@ def read_odometry(path: str | os.PathLike, frames: Int[np.ndarray, " T"]) -> Odo
     else:
         for (i, j), name in zip(pairs, covs, strict=True):
             cov[:, i, j] = cov[:, j, i] = table[name]
-    return Odometry(np.column_stack([table[axis] for axis in AXES])[first], cov[first])
+    increment = np.column_stack([table[axis] for axis in AXES])
+    return Odometry(increment[first], cov[first], np.column_stack(shifts)[first] if shifts else None)
+
+
+def write_odometry(path: str | os.PathLike, odometry: Odometry, frames: Int[np.ndarray, " T"] | None = None) -> Path:
+    """Write an odometry table, with its covariance; frames count from 0 unless numbered otherwise.
+
+    Raises:
+        ValueError: for an ending other than `.csv` and `.parquet`.
+        OSError: if the place cannot be written; what was there before stays.
+    """
+    columns: dict[str, np.ndarray] = {"frame": np.arange(len(odometry.increment)) if frames is None else frames}
+    columns |= dict(zip(AXES, np.asarray(odometry.increment).T, strict=True))
+    for i in range(6):
+        columns |= {f"cov_{AXES[i]}_{AXES[j]}": np.asarray(odometry.cov)[:, i, j] for j in range(i, 6)}
+    if odometry.sensor_shift_m is not None:
+        columns |= dict(zip(SHIFTS, np.asarray(odometry.sensor_shift_m).T, strict=True))
+    return write_table(path, columns)
 
 
 def from_velocities(
@@ -138,7 +163,7 @@ def from_poses(T_w_r: Float[np.ndarray, "T 7"], std: Float[np.ndarray, "6"]) -> 
     """
     from scipy.spatial.transform import Rotation
 
-    T_w_r = np.asarray(T_w_r, np.float64)
+    T_w_r = np.array(T_w_r, np.float64)  # SciPy wants it writable
     rotation = Rotation.from_quat(T_w_r[:, 3:], scalar_first=True)
     increment = np.zeros((len(T_w_r), 6))
     increment[1:, :3] = rotation[:-1].apply(np.diff(T_w_r[:, :3], axis=0), inverse=True)

@@ -101,7 +101,6 @@ def recording_from_tracks(
     *,
     time_s: Float[np.ndarray, " T"],
     odometry: Odometry,
-    sensor_shift_m: Float[np.ndarray, "T 3"] | None = None,
     robot_start: Float[np.ndarray, "7"] | None = None,
     start_cov: Float[np.ndarray, "14 14"] | None = None,
 ) -> Recording:
@@ -114,8 +113,7 @@ def recording_from_tracks(
         tracks: sightings, at most one of a track in a frame.
         calibration: of the images.
         time_s: time of each frame, s.
-        odometry: increments that lead to each frame.
-        sensor_shift_m: commanded displacement of the camera in the robot frame since the frame before, m; none.
+        odometry: increments that lead to each frame, and the commanded displacement of the camera, if it has one.
         robot_start: pose T_w_r before the first frame; the origin.
         start_cov: covariance of robot and sensor pose there; zero.
 
@@ -147,7 +145,7 @@ def recording_from_tracks(
         time_s=np.asarray(time_s, np.float64),
         odometry=odometry.increment,
         odometry_cov=odometry.cov,
-        sensor_shift_m=np.zeros((num_frames, 3)) if sensor_shift_m is None else sensor_shift_m,
+        sensor_shift_m=np.zeros((num_frames, 3)) if odometry.sensor_shift_m is None else odometry.sensor_shift_m,
         track_id=ids,
         uv_px=pixels,
         is_valid=is_valid,
