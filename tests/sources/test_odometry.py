@@ -59,17 +59,17 @@ def test_the_mean_of_two_measurements_counts():
 
 
 def test_covariance_of_the_sum_is_that_of_the_noise():
-    """10 000 drives with white noise of different size on each axis: the variance of the place at the end."""
+    """2500 drives with white noise of different size on each axis: the variance of the place at the end."""
     rng, num_frames, step_s = np.random.default_rng(0), 40, 0.1
     stds = np.array([0.5, 0.2, 0.1])
     times = step_s * np.arange(num_frames)
-    end = np.zeros((10_000, 3))
+    end = np.zeros((2500, 3))
     for drive in end:
         velocity = [3.0, 0, 0] + stds * rng.normal(size=(num_frames, 3))
         found = from_velocities(times, velocity, np.zeros((num_frames, 3)), stds, 0.05)
         drive[:] = found.increment[:, :3].sum(axis=0)
     claimed = found.cov[:, range(3), range(3)].sum(axis=0)
-    np.testing.assert_allclose(end.var(axis=0) / claimed, 1.0, atol=0.05)  # 1.4 % standard error, 1.3 % for the ends
+    np.testing.assert_allclose(end.var(axis=0) / claimed, 1.0, atol=0.12)  # 2.8 % standard error, 1.3 % for the ends
     np.testing.assert_allclose(found.cov[7], np.diag([*(stds * step_s) ** 2, *[0.005**2] * 3]), atol=1e-15)
 
 

@@ -12,10 +12,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vcjax.recording import Recording
+from vcjax.recording import Truth
 from vcjax.sources.calibration import Calibration
 from vcjax.sources.front_end import FrontEnd, track_images
 from vcjax.sources.odometry import Odometry, unknown_motion
+from vcjax.sources.recording_file import RecordingFile
 from vcjax.sources.tracks import recording_from_tracks
 
 MAX_GAP_S = 0.1
@@ -103,10 +104,14 @@ class ImageSequence:
         poses = interpolated(self.truth, self.time_s, max_gap_s)
         if self.truth.of == "robot":
             return poses
-        mount = np.tile(self.calibration.T_r_s, (len(self), 1))
+        return _robot_of_camera(poses, self.mounts())
+
+    def mounts(self) -> Float[np.ndarray, "T 7"]:
+        """Pose T_r_s of the camera in the robot at each image, with its commanded displacement."""
+        mounts = np.tile(self.calibration.T_r_s, (len(self), 1))
         if self.odometry is not None and self.odometry.sensor_shift_m is not None:
-            mount[:, :3] += np.cumsum(self.odometry.sensor_shift_m, axis=0)
-        return _robot_of_camera(poses, mount)
+            mounts[:, :3] += np.cumsum(self.odometry.sensor_shift_m, axis=0)
+        return mounts
 
 
 def record(
@@ -114,21 +119,44 @@ def record(
     options: FrontEnd | None = None,
     odometry: Odometry | None = None,
     progress: Callable[[int], None] | None = None,
-) -> Recording:
-    """A recording of an image sequence, with the tracks of `front_end.track_images`.
+    *,
+    robot_start: Float[np.ndarray, "7"] | None = None,
+    start_cov: Float[np.ndarray, "14 14"] | None = None,
+) -> RecordingFile:
+    """A recording of an image sequence, with the tracks of `front_end.track_images`, and what is known beside it.
+
+    True poses are those of the sequence, in the world that they are given in: the start of the recording is another
+    one unless it is given, and nothing is aligned.
 
     Args:
         sequence: the images.
         options: of the front end.
         odometry: motion that leads to each image; that of the sequence; without either, the motion is unknown.
         progress: called with the number of images done after each.
+        robot_start: pose T_w_r before the first image; the origin.
+        start_cov: covariance of robot and sensor pose there; zero.
+
+    Returns:
+        The recording with true poses, as far as there are, paths of the images, and their calibration.
 
     Raises:
         ModuleNotFoundError, FileNotFoundError, ValueError: as reading and tracking do.
     """
     tracks = track_images(sequence.images(), options, progress)
     odometry = odometry or sequence.odometry or unknown_motion(sequence.time_s)
-    return recording_from_tracks(tracks, sequence.calibration, time_s=sequence.time_s, odometry=odometry)
+    recording = recording_from_tracks(
+        tracks,
+        sequence.calibration,
+        time_s=sequence.time_s,
+        odometry=odometry,
+        robot_start=robot_start,
+        start_cov=start_cov,
+    )
+    robot, truth = sequence.true_robot_poses(), None
+    if robot is not None:
+        truth = Truth(robot, sequence.mounts(), np.zeros((len(sequence), 0, 3)), np.zeros(0, bool))
+    paths = tuple(str(path.absolute()) for path in sequence.paths)
+    return RecordingFile(recording, truth, None, paths, sequence.calibration)
 
 
 def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width"]:

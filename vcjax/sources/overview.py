@@ -86,7 +86,7 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     seen.plot(time_s, np.sum(np.asarray(recording.is_valid), axis=1), color=_BLUE)
     seen.set(xlabel="time (s)", ylabel="features seen", title="Features in each frame", ylim=(0, None))
     if len(length):
-        bins = np.geomspace(1, max(length.max(), 2), 30)
+        bins = np.unique(np.rint(np.geomspace(1, length.max() + 1, 30))) - 0.5  # whole numbers in each
         lengths.hist(length, bins, color=_BLUE)
         lengths.set_xscale("log")
     lengths.set(xlabel="length (frames)", ylabel="tracks", title=f"{len(ids)} tracks")
@@ -100,7 +100,7 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     image.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="u (px)", ylabel="v (px)")
     image.set_title("Where tracks begin")
     if np.any(is_moving):
-        image.legend(loc="upper right", fontsize=8)
+        image.legend(loc="lower right", fontsize=8)
 
     path.plot(*_odometry_path(recording)[:, :2].T, color=_GREY, label="odometry alone")
     if truth is not None:

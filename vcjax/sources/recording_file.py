@@ -13,7 +13,7 @@ columns, F of features in the world, L of labelled tracks:
 | `truth_robot`, `truth_sensor` | (T, 7) | optional: true poses; NaN where nobody knows |
 | `truth_landmarks_m`, `truth_is_moving` | (T, F, 3), (F,) | with them: the features of the world; F may be 0 |
 | `label_track_id`, `label` | (L,) | optional: tracks and what each follows, a number of `TrackLabel` |
-| `image_path` | (T,) | optional: the image of each frame, relative to the file's folder or absolute |
+| `image_path` | (T,) | optional: the image of each frame; relative paths begin at the file's folder |
 | `calibration` | () | optional: the calibration of the images as JSON, see `calibration.py` |
 
 Floating-point numbers may be of any size, and are read as they were written.
