@@ -9,6 +9,7 @@ import pytest
 from rendered import rendered, tracked
 
 import vcjax as vc
+from vcjax.sources import front_end
 from vcjax.sources.calibration import Calibration
 from vcjax.sources.front_end import FrontEnd, track_images
 from vcjax.sources.image_sequence import record
@@ -54,6 +55,16 @@ def test_ids_are_new_and_sightings_without_gaps():
     for track in ids:
         frames = tracks.frame[tracks.track_id == track]
         np.testing.assert_array_equal(frames, np.arange(frames[0], frames[0] + len(frames)))
+
+
+def test_of_tracks_that_run_together_the_oldest_stays(monkeypatch):
+    def all_to_one_place(before, image, points, options):
+        return np.full_like(points, 50.0), np.arange(len(points)) > 0
+
+    monkeypatch.setattr(front_end, "_follow", all_to_one_place)
+    tracks = track_images([rendered().sequence.read(t) for t in range(2)])
+    first, second = (set(tracks.track_id[tracks.frame == t].tolist()) for t in range(2))
+    assert len(first) > 100 and first & second == {1}
 
 
 def test_the_same_images_give_the_same_tracks():
