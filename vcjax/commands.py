@@ -18,11 +18,11 @@ from vcjax.filter.config import FilterConfig
 from vcjax.report.figures import write_figures
 from vcjax.report.tables import write_tables
 from vcjax.simulation.scenarios import Scenario, paper
+from vcjax.storage import check_writable, write_file
 from vcjax.study import benchmark
 from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.reproduce import load_results, reproduce
 from vcjax.study.results import save
-from vcjax.study.storage import check_writable, write_file
 from vcjax.study.summary import summarise
 
 GateName = Literal["RE", "VC"]

@@ -81,13 +81,13 @@ class Recording(eqx.Module):
 class Truth(eqx.Module):
     """What really happened, known in simulation only."""
 
-    robot: Float[Array, "T 7"]
+    robot: Float[AnyArray, "T 7"]
     """Robot pose T_w_r of each frame."""
-    sensor: Float[Array, "T 7"]
+    sensor: Float[AnyArray, "T 7"]
     """Sensor pose T_r_s of each frame."""
-    landmarks_m: Float[Array, "T F 3"]
+    landmarks_m: Float[AnyArray, "T F 3"]
     """Place of every feature in each frame; feature number = track id."""
-    is_moving: Bool[Array, " F"]
+    is_moving: Bool[AnyArray, " F"]
     """Whether a feature moves at any time."""
 
 

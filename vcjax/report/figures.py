@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
+from vcjax.storage import write_file
 from vcjax.study.paper import RE, VC, VC_OSCILLATING, Cell, cells
-from vcjax.study.storage import write_file
 from vcjax.study.summary import mean_and_error, student_t
 
 _EXPERIMENTS = {3: (2, "forward"), 4: (3, "lateral"), 5: (3, "inverse forward")}

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import xarray as xr
 
+from vcjax.storage import write_file
 from vcjax.study.paper import SPEEDS_M_S, TABLES, Cell, Claim, cells, claims, pairs, paper_figures
-from vcjax.study.storage import write_file
 from vcjax.study.summary import DECIMALS, FIGURES, format_mean, paired_difference, runs_text, student_t, summarise
 
 REPORTED = (

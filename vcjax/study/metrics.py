@@ -32,7 +32,7 @@ def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
         "dynamic_deletions": _count_by_feature(dynamic_id, num_features),
         "inconsistent_deletions": _count_by_feature(info.inconsistent_id, num_features),
         "frames_mapped": _count_by_feature(info.track_id, num_features),
-        "is_moving": truth.is_moving,
+        "is_moving": jnp.asarray(truth.is_moving),
         "is_finite": jnp.all(info.is_finite),
         "map_full_frames": jnp.sum(info.map_is_full),
         "robot": info.vehicle[:, :7],
@@ -48,11 +48,12 @@ def trajectory_errors(info: FrameInfo, truth: Truth) -> dict[str, Float[Array, "
     P is singular up to rounding, as without odometry noise: there the error has no size that it could be compared to.
     """
     robot, cov = info.vehicle[:, :7], info.vehicle_cov[:, :7, :7]
-    error_xy = robot[:, :2] - truth.robot[:, :2]
-    relative = jax.vmap(lambda q, p: quaternion_product(quaternion_conjugate(q), p))(truth.robot[:, 3:], robot[:, 3:])
+    true = jnp.asarray(truth.robot)
+    error_xy = robot[:, :2] - true[:, :2]
+    relative = jax.vmap(lambda q, p: quaternion_product(quaternion_conjugate(q), p))(true[:, 3:], robot[:, 3:])
     sine = jnp.sqrt(jnp.sum(relative[:, 1:] ** 2, axis=1))
     yaw, yaw_H = jax.vmap(jax.value_and_grad(yaw_from_quaternion))(robot[:, 3:])
-    error_yaw = _wrap(yaw - jax.vmap(yaw_from_quaternion)(truth.robot[:, 3:]))
+    error_yaw = _wrap(yaw - jax.vmap(yaw_from_quaternion)(true[:, 3:]))
 
     # Pose (x, y, yaw) as a linear function of the error in [x y z qw qx qy qz].
     G = jnp.zeros((robot.shape[0], 3, 7), robot.dtype)

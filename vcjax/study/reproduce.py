@@ -24,10 +24,10 @@ from vcjax.gates.gate import AbstractGate
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import paper
+from vcjax.storage import remove_leftovers, write_file
 from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.paper import TABLES, Cell, cells
 from vcjax.study.results import attributes, load, load_attributes, save
-from vcjax.study.storage import remove_leftovers, write_file
 from vcjax.study.sweep import Experiment
 
 SEEDS_PER_BLOCK = 25

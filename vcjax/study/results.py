@@ -20,7 +20,7 @@ from jaxtyping import PRNGKeyArray
 
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import simulate
-from vcjax.study.storage import replacing
+from vcjax.storage import replacing
 from vcjax.study.sweep import Experiment
 
 SCHEMA = 1

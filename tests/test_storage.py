@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from vcjax.study.storage import LEFTOVER_AGE_S, check_writable, replacing, write_file
+from vcjax.storage import LEFTOVER_AGE_S, check_writable, replacing, write_file
 
 
 def names(folder) -> list[str]:

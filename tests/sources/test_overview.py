@@ -1,0 +1,63 @@
+"""Overviews: what they say is counted from the recording."""
+
+import dataclasses
+
+import numpy as np
+from rendered import rendered, tracked
+from test_recording import good_recording
+from test_recording_file import full
+
+from vcjax.sources.overview import draw_overview, summary
+from vcjax.sources.recording_file import RecordingFile
+from vcjax.sources.tracks import recording_from_tracks
+
+
+def said(content) -> dict[str, str]:
+    return {line[:15].strip(): line[16:] for line in summary(content).splitlines()}
+
+
+def test_summary_by_hand():
+    """Five frames at 10 Hz, four features of which one is missing in each of the first four."""
+    recording = dataclasses.replace(good_recording(), time_s=np.array([0.1, 0.2, 0.3, 0.6, 0.7]))
+    found = said(recording)
+    assert found["frames"] == "5 in 0.6 s"
+    assert found["rate"] == "10 Hz; longest gap 0.3 s, before frame 3"
+    assert found["tracks"] == "4, 16 sightings"
+    assert found["track length"].startswith("4 / 4 / 4 / 4 / 4 frames")
+    assert found["seen per frame"].startswith("3 / 3 / 3 / 3 / 4 ")
+    assert found["camera"] == "640 × 480 px, focal lengths 320, 320 px, centre 320, 240 px"
+    assert found["odometry"].endswith("standard deviations 0.001 m, 0.0573° per frame")
+    assert found["camera motion"] == "fixed on the robot" and found["truth"] == "none" and "labels" not in found
+
+
+def test_summary_of_all_that_is_known():
+    found = said(full())
+    assert found["truth"] == "poses of 3 frames"
+    assert found["labels"] == "1 unknown, 0 static, 1 moving, 1 bad"
+    assert found["images"] == "640 × 480 px, distortion none" and found["image files"].startswith("images/0 ä.png …")
+
+
+def test_recordings_without_anything():
+    recording = good_recording()
+    empty = dataclasses.replace(
+        recording, is_valid=np.zeros((5, 4), bool), is_last=np.zeros((5, 4), bool), odometry=np.zeros((5, 6))
+    )
+    found = said(empty)
+    assert found["tracks"] == "0, 0 sightings" and "5 frames without any" in found["seen per frame"]
+    assert found["odometry"].startswith("none (standard deviations")
+    draw_overview(empty)
+
+
+def test_picture_shows_what_there_is(tmp_path):
+    world, tracks = rendered(), tracked()
+    sequence = world.sequence
+    recording = recording_from_tracks(tracks, sequence.calibration, time_s=sequence.time_s, odometry=sequence.odometry)
+    content = RecordingFile(recording, world.truth, world.followed(tracks).labels)
+    assert "over 0, 0.09511, 0 m" in said(content)["camera motion"]
+    figure = draw_overview(content)
+    seen, lengths, image, path = figure.axes
+    assert len(seen.lines[0].get_ydata()) == 30 and sum(bar.get_height() for bar in lengths.patches) > 100
+    assert [text.get_text() for text in image.get_legend().get_texts()] == ["tracks", "labelled moving"]
+    assert [line.get_label() for line in path.lines] == ["odometry alone", "truth"]
+    figure.savefig(tmp_path / "a.png")
+    assert (tmp_path / "a.png").stat().st_size > 10_000
