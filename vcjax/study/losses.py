@@ -36,7 +36,7 @@ class Labelled(NamedTuple):
 def candidates(info: FrameInfo, truth: Truth) -> Labelled:
     """Every measured candidate of every frame, (T, K)."""
     counts = info.is_measured & (info.candidate_id >= 0)
-    is_mover = truth.is_moving[jnp.where(counts, info.candidate_id, 0)] & counts
+    is_mover = jnp.asarray(truth.is_moving)[jnp.where(counts, info.candidate_id, 0)] & counts
     return Labelled(jnp.where(counts, info.p_dynamic, 0.0), is_mover, counts)
 
 
@@ -47,7 +47,7 @@ def tracks(info: FrameInfo, truth: Truth) -> Labelled:
     log_not = jnp.log1p(-jnp.minimum(each.p, 1.0 - _CLOSEST)).ravel()
     total = jnp.zeros(num_features, log_not.dtype).at[place].add(log_not, mode="drop")
     counts = jnp.zeros(num_features, bool).at[place].set(True, mode="drop")
-    return Labelled(-jnp.expm1(total), truth.is_moving & counts, counts)
+    return Labelled(-jnp.expm1(total), jnp.asarray(truth.is_moving) & counts, counts)
 
 
 def f1_loss(labelled: Labelled) -> Float[Array, ""]:
