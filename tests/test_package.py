@@ -25,11 +25,13 @@ ROOMS = {
     "gates": {"fields", "models", "recording", "ekf"},
     "filter": {"fields", "models", "recording", "ekf", "gates"},
     "simulation": {"fields", "models", "recording"},
-    "sources": {"fields", "storage", "models", "recording", "simulation"},
-    "study": (below_study := {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation"}),
-    "report": below_study | {"study"},
     "devices": set(),
-    "commands": below_study | {"study", "report", "devices"},
+    "sources": {"fields", "storage", "models", "recording", "simulation"},
+    "study": (
+        below_study := {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation", "devices"}
+    ),
+    "report": below_study | {"study"},
+    "commands": below_study | {"study", "report"},
     "cli": {"filter", "study", "commands"},
     "__main__": {"cli"},
 }

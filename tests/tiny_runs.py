@@ -23,7 +23,7 @@ from vcjax.study.results import PER_FEATURE, PER_FRAME, PER_RUN
 from vcjax.study.sweep import Experiment
 
 NUM_SEEDS = 3
-"""Lanes in a call. A call of another number of lanes is another compilation."""
+"""Runs of an experiment in most tests."""
 NUM_FRAMES = 12
 NUM_FEATURES = 162
 MOVERS = [21, 23, 30, 32, 102, 104]

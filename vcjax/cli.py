@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Sequence
 from typing import Annotated
 
+import jax
 import tyro
 from rich.console import Console
 
@@ -30,6 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command(console)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         say(console, f"vcjax: {error}", style="bold red")
+        return 1
+    except jax.errors.JaxRuntimeError as error:
+        if jax.process_count() == 1:
+            raise
+        say(console, f"vcjax: another process has stopped or is late ({str(error).splitlines()[0]}).", style="bold red")
         return 1
     except KeyboardInterrupt:
         say(console, "vcjax: stopped; what `vcjax reproduce` has finished is on disk, and it will go on from there.")

@@ -13,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from vcjax.devices import Devices
+from vcjax.devices import Devices, agree
 from vcjax.filter.config import FilterConfig
 from vcjax.report.figures import write_figures
 from vcjax.report.tables import write_tables
@@ -61,7 +61,11 @@ class Reproduce:
         if results:
             _report(load_results(self.out), self.out, console)
         else:
-            say(console, "finished; other processes are still at work, and the last one writes tables and figures.")
+            say(
+                console,
+                "finished; others are still at work, and the last one writes tables and figures. "
+                "If one of them has died, run the same command again.",
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +101,12 @@ class Run:
 
     def __call__(self, console: Console) -> None:
         """Run, summarise, save."""
-        check_writable(self.out)
+        refused = None
+        try:
+            check_writable(self.out)
+        except OSError as error:
+            refused = error
+        agree(refused)
         with _progress(console, "running") as show:
             runs = monte_carlo(self.scenario, self.config, num_seeds=self.seeds, key=_key(self.key), progress=show)
         if jax.process_index() > 0:  # every process has all the runs
@@ -124,6 +133,7 @@ class Bench:
 
     def __call__(self, console: Console) -> None:
         """Measure, print, save, compare."""
+        accepted = None if self.baseline is None else benchmark.read_ratios(self.baseline)
         if self.json is not None:
             check_writable(self.json)
         measured = benchmark.where()
@@ -135,8 +145,11 @@ class Bench:
                 print(f"{name:28s} {f'{value:.4g}' if isinstance(value, float) else value}", flush=True)
             if self.json is not None:
                 write_file(self.json, f"{json.dumps(measured, indent=1)}\n".encode())
-        if self.baseline is not None and (worse := benchmark.compare(measured, self.baseline)):
-            raise ValueError("; ".join(worse))
+        if accepted is not None:
+            worse = benchmark.compare(measured, accepted)
+            say(console, f"compared with {self.baseline}: {', '.join(accepted)}")
+            if worse:
+                raise ValueError("; ".join(worse))
 
 
 def _key(number: int) -> PRNGKeyArray:

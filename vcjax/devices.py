@@ -1,9 +1,14 @@
-"""The devices and processes that a command works with."""
+"""The devices and processes that the work is shared by."""
 
 import dataclasses
 import os
+from collections.abc import Sequence
 
 import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, PyTree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +45,8 @@ class Devices:
             return False
         if self.coordinator is None or self.num_processes is None or self.process_id is None:
             raise ValueError("--coordinator, --num-processes and --process-id belong together: give all three.")
-        if not self.coordinator.rpartition(":")[2].isdecimal():
+        host, _, port = self.coordinator.rpartition(":")
+        if not host or not port.isdecimal() or not 0 < int(port) < 2**16:
             raise ValueError(f"--coordinator {self.coordinator}: give HOST:PORT of process 0, the same to all.")
         if not 0 <= self.process_id < self.num_processes:
             raise ValueError(
@@ -64,6 +70,8 @@ class Devices:
 
     def _join(self) -> None:
         """Become one of several processes, by JAX's own means."""
+        # A request to stop is to stop a process, not to be noted.
+        jax.config.update("jax_enable_preemption_service", False)
         try:
             jax.distributed.initialize(
                 self.coordinator,
@@ -75,6 +83,46 @@ class Devices:
             )
         except (ValueError, TypeError, RuntimeError) as error:
             raise ValueError(
-                f"--distributed: {error} Start the processes by SLURM, Open MPI or Kubernetes, or give --coordinator "
-                "HOST:PORT, --num-processes and --process-id."
+                f"processes cannot be joined: {error} Start them by SLURM, Open MPI or Kubernetes with --distributed, "
+                "or give each --coordinator HOST:PORT, --num-processes and --process-id."
             ) from None
+        agree(None)
+
+
+def meet(devices: Sequence[jax.Device]) -> None:  # pyright: ignore[reportInvalidTypeForm] (jax.Device is untyped)
+    """Let the processes of some devices connect, before work that takes them different times.
+
+    To connect for the first time they have 30 s; once connected, one waits for another however long it takes.
+    """
+    if len({device.process_index for device in devices}) > 1:
+        gather(spread(np.arange(len(devices)), Mesh(np.array(devices), ("lane",))))
+
+
+def agree(error: Exception | None) -> None:
+    """Go on only where no process has failed: what one is refused, all are.
+
+    Raises:
+        Exception: this process's own error, or ValueError where another has one.
+    """
+    if jax.process_count() > 1:
+        meet(jax.devices())
+        is_fine = multihost_utils.process_allgather(np.array(error is None))
+        if error is None and not np.all(is_fine):
+            raise ValueError(f"process {int(np.argmin(is_fine))} was refused, so all stop; see what it says.")
+    if error is not None:
+        raise error
+
+
+def spread(lanes: PyTree[np.ndarray], mesh: Mesh) -> PyTree[Array]:
+    """Arrays with lanes as leading axis, each device of a mesh with its part, whichever process it belongs to."""
+    by_lane = NamedSharding(mesh, PartitionSpec("lane"))
+    return jax.tree.map(
+        lambda a: jax.make_array_from_callback(a.shape, by_lane, lambda part: a[part], dtype=a.dtype), lanes
+    )
+
+
+def gather(result: PyTree[Array]) -> PyTree[np.ndarray]:
+    """Arrays of all devices on this host; the parts of other processes come from there."""
+    if all(value.is_fully_addressable for value in jax.tree.leaves(result)):
+        return jax.device_get(result)
+    return multihost_utils.process_allgather(result, tiled=True)

@@ -88,7 +88,7 @@ def require_count(owner: object, name: str, minimum: int) -> None:
         raise ValueError(f"{type(owner).__name__}({name}={value!r}): give a whole number of at least {minimum}.")
 
 
-def require_choice(owner: object, name: str, choices: Sequence[str | bool]) -> None:
+def require_choice(owner: object, name: str, choices: Sequence[str | bool | None]) -> None:
     """Refuse a static field that is none of the choices.
 
     Raises:

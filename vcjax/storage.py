@@ -33,11 +33,12 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     os.close(handle)
     temporary = Path(name)
     try:
-        yield temporary
-        with open(temporary, "rb") as written:
-            os.fsync(written.fileno())
-        temporary.chmod(0o666 & ~_umask())
-        os.replace(temporary, path)
+        with _naming(path, instead_of=temporary):
+            yield temporary
+            with open(temporary, "rb") as written:
+                os.fsync(written.fileno())
+            temporary.chmod(0o666 & ~_umask())
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -81,11 +82,17 @@ def check_writable(path: str | os.PathLike) -> None:
 
 
 @contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Name the place that was asked for, and not that of a temporary file, in the error of the system."""
+def _naming(path: Path, instead_of: Path | None = None) -> Iterator[None]:
+    """Name the place that was asked for, and not a temporary file or none, in the error of the system.
+
+    An error that names any other file than `instead_of` is left as it is, if that is given.
+    """
     try:
         yield
     except OSError as error:
+        is_other = instead_of is not None and error.filename not in (None, str(instead_of), instead_of)
+        if is_other or error.errno is None:
+            raise
         raise type(error)(error.errno, error.strerror, str(path)) from None
 
 

@@ -172,7 +172,7 @@ def test_failed_seed_is_flagged_counted_and_spoils_no_other(monkeypatch):
 
 
 def test_number_of_devices_makes_no_difference(tmp_path):
-    """Two devices, in a process of their own, against the one of this process: the last lane is a copy to fill up."""
+    """Two devices, in a process of their own, against the one of this process: the second has a place left empty."""
     script = f"""
         import sys
         sys.path.insert(0, {str(Path(tiny_runs.__file__).parent)!r})

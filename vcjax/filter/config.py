@@ -47,9 +47,10 @@ class FilterConfig(eqx.Module):
     everything that stays, unless a landmark would come back from there, as badly mapped ones rarely do."""
     blacklist_capacity: int = eqx.field(static=True, default=0)
     """How many deleted features are remembered and never born again; 0: a deleted feature may come back."""
-    skip_free_slots: bool = eqx.field(static=True, default=True)
+    skip_free_slots: bool | None = eqx.field(static=True, default=None)
     """Pass over the part of P in use only, by a loop whose length depends on the map: best where runs go one by one, as
-    on a CPU. False passes over all of P at once: best under `vmap`. The numbers are the same."""
+    on a CPU. False passes over all of P at once: for runs side by side, as on an accelerator. None: by the default
+    device. The numbers are the same."""
     reverse_mode: bool = eqx.field(static=True, default=False)
     """Make the run differentiable in reverse mode, and in that only: loops of fixed length or with a derivative of
     their own, and √T checkpoints, between which the way back passes through the frames once more."""
@@ -95,7 +96,8 @@ class FilterConfig(eqx.Module):
             ("smoothing", SMOOTHINGS),
             ("choose_among", ("predicted", "measured")),
             ("birth_order", ("lowest_id", "random")),
-            *((name, (True, False)) for name in ("retire", "skip_free_slots", "reverse_mode", "toolbox_parity")),
+            ("skip_free_slots", (None, True, False)),
+            *((name, (True, False)) for name in ("retire", "reverse_mode", "toolbox_parity")),
         ):
             require_choice(self, name, choices)
         if self.update == "stacked" and self.smoothing != "hard":

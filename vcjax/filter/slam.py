@@ -187,15 +187,14 @@ def _finish(
     """Births, and the frame's info."""
     state, born, is_full = landmark_map.give_birth(config, state, frame, is_mapped, num_births)
     attempts = max(config.births_first_frame, config.births_per_frame)
-    vehicle_cov = state.P_vv
     info = FrameInfo(
         vehicle=state.vehicle,
-        vehicle_cov=vehicle_cov,
+        vehicle_cov=state.P_vv,
         born_id=jnp.full(attempts, FREE, born.dtype).at[:num_births].set(born),
         track_id=state.track_id,
         num_coordinates=VEHICLE + jnp.sum(jnp.where(state.is_mapped, jnp.where(state.is_euclidean, 3, SLOT), 0)),
         map_is_full=is_full,
-        is_finite=jnp.all(jnp.isfinite(state.vehicle)) & jnp.all(jnp.isfinite(vehicle_cov)),
+        is_finite=jnp.all(jnp.isfinite(state.vehicle)) & jnp.all(jnp.isfinite(state.P_vv)),
         **info_of_candidates,
     )
     return state, info

@@ -180,7 +180,8 @@ def _downdate(
     config: FilterConfig, state: FilterState, DU: Float[Array, "K2 M"], U: Float[Array, "K2 M"]
 ) -> Float[Array, "M M"]:
     """P_mm - Uᵀ D U, all of it or the part in use; free slots' rows mean nothing."""
-    if not config.skip_free_slots:
+    is_cpu = jax.default_backend() == "cpu"
+    if not (is_cpu if config.skip_free_slots is None else config.skip_free_slots):
         return state.P_mm - DU.T @ U
     num_used = jnp.max(jnp.where(state.is_mapped, jnp.arange(1, len(state.is_mapped) + 1), 0))
     return (reversible_downdate if config.reverse_mode else downdate)(state.P_mm, DU, U, num_used)

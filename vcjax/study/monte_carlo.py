@@ -14,10 +14,10 @@ from numbers import Integral
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, PRNGKeyArray, PyTree
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, PRNGKeyArray
 
+from vcjax.devices import gather, meet, spread
 from vcjax.fields import require_key, require_kind, require_single
 from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.slam import run
@@ -61,7 +61,8 @@ def monte_carlo(
         progress: called with (lanes done, lanes in all).
 
     In a program of several processes (`jax.distributed.initialize`), each process makes the same call, works on its
-    own part of the lanes, and returns them all. With `devices=jax.local_devices()` it works alone.
+    own part of the lanes, and returns them all; the first time they have 30 s to find each other. With
+    `devices=jax.local_devices()` a process works alone.
 
     Returns:
         xarray.Dataset with dimensions (*sweep paths, seed, frame or feature); see `results.as_dataset`.
@@ -125,30 +126,18 @@ def run_lanes(
     # On a CPU all calls have one size, whatever is asked for; elsewhere empty places cost: only the last call has any.
     places = math.ceil((LANES_PER_CALL if is_cpu else total) / len(devices))
     places = places if is_cpu else min(places, LANES_PER_ACCELERATOR)
+    meet(devices)
     done = []
     for first in range(0, total, places * len(devices)):
         new = np.arange(first, min(first + places * len(devices), total))
         lane = _share(new, len(devices), places)
         values = {path: value[lane] for path, value in swept.items()}
-        args = _spread((values, seeds[lane].astype(np.uint32), lane >= 0), mesh)
+        args = spread((values, seeds[lane].astype(np.uint32), lane >= 0), mesh)
         result = _run_lanes(experiment, *args, key, mesh, batch_size=1 if is_cpu else places)
-        done.append({name: value[lane >= 0] for name, value in _collect(result).items()})
+        done.append({name: value[lane >= 0] for name, value in gather(result).items()})
         if progress is not None:
             progress(first + len(new), total)
     return {name: np.concatenate([part[name] for part in done]) for name in done[0]}
-
-
-def _spread(lanes: PyTree[np.ndarray], mesh: Mesh) -> PyTree[Array]:
-    """Arrays with the lanes as leading axis, each device with its part, whichever process it belongs to."""
-    by_lane = NamedSharding(mesh, PartitionSpec("lane"))
-    return jax.tree.map(lambda a: jax.make_array_from_callback(a.shape, by_lane, lambda part: a[part]), lanes)
-
-
-def _collect(result: dict[str, Array]) -> dict[str, np.ndarray]:
-    """Results of all devices on this host; those of other processes come from there."""
-    if all(value.is_fully_addressable for value in result.values()):
-        return jax.device_get(result)
-    return multihost_utils.process_allgather(result, tiled=True)
 
 
 def _share(lanes: np.ndarray, num_devices: int, places: int) -> np.ndarray:

@@ -18,6 +18,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PRNGKeyArray
 
+from vcjax.devices import agree
 from vcjax.fields import require_key
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.gate import AbstractGate
@@ -85,11 +86,12 @@ def reproduce(
     directory, key = Path(directory), jax.random.key(0) if key is None else key
     require_key("reproduce", key)
     blocks = _all_blocks(tables, num_seeds)
-    for cell in cells():
-        for _, _, path in _blocks(directory / "runs" / cell.identifier):
-            _refuse_other_settings(path, cell_experiment(cell), key)
-        remove_leftovers(directory / "runs" / cell.identifier, "seeds_*.nc")
-    write_file(directory / "README.txt", _README.encode())  # also tells at once whether the place can be written
+    refused = None
+    try:
+        _prepare(directory, key)
+    except (ValueError, OSError) as error:
+        refused = error
+    agree(refused)
     mine = _my_part(blocks, _missing(directory, blocks))
     for done, (cell, first, end) in enumerate(mine, start=1):
         _run_block(directory / "runs" / cell.identifier, cell, first, end, key)
@@ -121,6 +123,15 @@ def load_results(
             f"{directory}: the cells have no seed in common; run `vcjax reproduce` again to complete them."
         )
     return {cell: runs.sel(seed=seeds) for cell, runs in results.items()}
+
+
+def _prepare(directory: Path, key: PRNGKeyArray) -> None:
+    """Refuse a directory of other settings or that cannot be written, and clear what killed processes left."""
+    for cell in cells():
+        for _, _, path in _blocks(directory / "runs" / cell.identifier):
+            _refuse_other_settings(path, cell_experiment(cell), key)
+        remove_leftovers(directory / "runs" / cell.identifier, "seeds_*.nc")
+    write_file(directory / "README.txt", _README.encode())  # also tells at once whether the place can be written
 
 
 def _all_blocks(tables: Collection[int], num_seeds: int) -> list[Block]:

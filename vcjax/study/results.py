@@ -145,8 +145,8 @@ def save(dataset: Any, path: str | os.PathLike) -> Path:
         except (OSError, RuntimeError) as error:  # the library names a full disk in many ways, none of them so
             free_mib, cause = shutil.disk_usage(temporary.parent).free / 2**20, getattr(error, "strerror", None)
             raise OSError(
-                f"{path}: not written ({cause or error}; {free_mib:.1f} MiB are free there); make room and run again: "
-                "what was written before stays."
+                f"{path}: not written ({cause or error}; {free_mib:.1f} MiB are free there); what was written before "
+                "stays, so run again when there is room."
             ) from None
     return Path(path)
 
