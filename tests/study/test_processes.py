@@ -1,7 +1,6 @@
 """Several processes that work together: the numbers of one, each part written by who ran it, and a death survived."""
 
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -47,6 +46,14 @@ results = module.reproduce(out, num_seeds=tiny_runs.NUM_SEEDS, tables=(2,), prog
 print(number, "found", len(results), flush=True)
 """
 
+_REFUSED = """
+from vcjax.study.reproduce import reproduce
+try:
+    reproduce(f"{out}/{number}", num_seeds=1)
+except (ValueError, OSError) as error:
+    print(error, flush=True)
+"""
+
 
 def start_two(script: str, *arguments) -> list[subprocess.Popen]:
     """Two processes that know of each other through a free port of this machine."""
@@ -76,6 +83,24 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
             assert_same_runs(found, expected, **ROUNDING)
 
 
+@pytest.mark.slow
+def test_a_late_process_is_waited_for(tmp_path):
+    """Longer than the 30 s in which JAX's processes must connect: they have connected before."""
+    late = "import time; time.sleep(40 * number)" + _MONTE_CARLO
+    for process in start_two(late, tmp_path):
+        process.communicate(timeout=600)
+        assert process.returncode == 0
+
+
+def test_what_one_process_is_refused_stops_all(tmp_path):
+    (tmp_path / "0").mkdir()
+    (tmp_path / "1").write_text("no folder")
+    told = [process.communicate(timeout=600)[0] for process in start_two(_REFUSED, tmp_path)]
+    assert "process 1 was refused, so all stop" in told[0]
+    assert f"{tmp_path / '1'}" in told[1] and "was refused" not in told[1]
+    assert not list((tmp_path / "0").rglob("*.nc"))
+
+
 @pytest.fixture
 def alone(tmp_path, monkeypatch):
     """The same work by one process."""
@@ -99,17 +124,24 @@ def test_each_process_writes_its_part(tmp_path, alone):
         xr.testing.assert_allclose(results[cell], runs, **ROUNDING)
 
 
-def test_a_process_that_dies_leaves_what_is_finished_and_a_restart_completes_it(tmp_path, alone, monkeypatch):
-    processes = start_two(_REPRODUCE, tmp_path, 600)  # after its first block each waits
+def test_a_process_that_dies_leaves_what_is_finished_and_a_restart_completes_it(tmp_path, alone):
+    """Process 1 is killed after its first block; process 0 does its part to the end."""
+    processes = start_two(_REPRODUCE.replace("(sys.argv[4])", "(sys.argv[4]) * number"), tmp_path, 600)
     deadline = time.monotonic() + 600
-    while len(list(tmp_path.glob("runs/*/*.nc"))) < 2:
-        assert all(process.poll() is None for process in processes) and time.monotonic() < deadline
-        time.sleep(0.05)
+
+    def wait_for(num_blocks, pattern):
+        while len(list(tmp_path.glob(pattern))) < num_blocks:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+    wait_for(1, "runs/*VC*/*.nc")
+    processes[1].kill()
+    wait_for(3, "runs/*/*.nc")
     for process in processes:
-        process.send_signal(signal.SIGKILL)
+        process.kill()
         process.communicate()
     before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("runs/*/*.nc")}
     results = reproduce(tmp_path, num_seeds=NUM_SEEDS, tables=(2,))
-    assert {path: path.stat().st_mtime_ns for path in before} == before and len(before) == 2
+    assert {path: path.stat().st_mtime_ns for path in before} == before and len(before) == 3
     for cell, runs in alone.items():
         xr.testing.assert_allclose(results[cell], runs, **ROUNDING)
