@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tiny_runs
 from jax.sharding import Mesh
+from jax.tree_util import Partial
 from tiny_runs import (
     MEASURES,
     NUM_FEATURES,
@@ -159,7 +160,7 @@ def test_failed_seed_is_flagged_counted_and_spoils_no_other(monkeypatch):
     experiment = Experiment(tiny_runs.scenario(), tiny_runs.config(STRICT))
     mesh = Mesh(np.array(jax.local_devices()[:1]), ("lane",))
     seeds, everyone = jnp.arange(NUM_SEEDS, dtype=jnp.uint32), jnp.ones(NUM_SEEDS, bool)
-    lanes = module._run_lanes(experiment, {}, seeds, everyone, KEY, mesh, NUM_SEEDS)
+    lanes = module._run_lanes(Partial(module._run_point, experiment), {}, seeds, everyone, KEY, mesh, NUM_SEEDS)
     assert lanes["is_finite"].tolist() == [seed != bad_seed for seed in range(NUM_SEEDS)]
 
     runs, good = strict_runs(), [0, 2]

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
+from jax.tree_util import Partial
 from jaxtyping import Array, PRNGKeyArray
 
 from vcjax.devices import gather, meet, spread
@@ -27,6 +28,7 @@ from vcjax.study.metrics import run_metrics
 from vcjax.study.results import as_dataset, import_xarray
 from vcjax.study.sweep import Experiment, Sweep, check_sweep, replace_at
 
+Work = Callable[[dict[str, Array], PRNGKeyArray], dict[str, Array]]
 LANES_PER_CALL = 64
 """Lanes in one compiled call on CPUs: what is finished between two reports of progress."""
 LANES_PER_ACCELERATOR = 256
@@ -81,7 +83,8 @@ def monte_carlo(
     axes = np.meshgrid(*values.values(), seeds, indexing="ij")
     shape = axes[0].shape
     *swept, lane_seed = (axis.ravel() for axis in axes)
-    lanes = run_lanes(experiment, dict(zip(values, swept, strict=True)), lane_seed, key, devices, progress)
+    swept = dict(zip(values, swept, strict=True))
+    lanes = run_lanes(Partial(_run_point, experiment), swept, lane_seed, key, devices, progress)
     lanes = {name: value.reshape(*shape, *value.shape[1:]) for name, value in lanes.items()}
     return as_dataset(lanes, experiment, values, seeds, key)
 
@@ -101,8 +104,8 @@ def _check_arguments(scenario, config, num_seeds: int, first_seed: int, key, dev
 
 
 def run_lanes(
-    experiment: Experiment,
-    swept: dict[str, np.ndarray],
+    work: Work,
+    values: dict[str, np.ndarray],
     seeds: np.ndarray,
     key: PRNGKeyArray,
     devices: Sequence[jax.Device] | None = None,  # pyright: ignore[reportInvalidTypeForm] (jax.Device is untyped)
@@ -111,14 +114,15 @@ def run_lanes(
     """Run a list of lanes, in calls of equal size so that one compilation serves any number of them.
 
     Args:
-        experiment: scenario and configuration.
-        swept: path → value of each lane.
+        work: what is done in each, a function of the lane's values and its seed's key that gives arrays by name. A
+            `jax.tree_util.Partial` of a function of some module compiles once for all values of its arguments.
+        values: values of each lane, by name.
         seeds: seed number of each lane.
         key: base key.
         devices: devices to use; all there are if None.
         progress: called with (lanes done, lanes in all).
 
-    Returns: the metrics of `metrics.run_metrics`, each with the lanes as leading axis.
+    Returns: what `work` gives, each array with the lanes as leading axis.
     """
     devices = jax.devices() if devices is None else list(devices)
     mesh = Mesh(np.array(devices), ("lane",))
@@ -131,9 +135,9 @@ def run_lanes(
     for first in range(0, total, places * len(devices)):
         new = np.arange(first, min(first + places * len(devices), total))
         lane = _share(new, len(devices), places)
-        values = {path: value[lane] for path, value in swept.items()}
-        args = spread((values, seeds[lane].astype(np.uint32), lane >= 0), mesh)
-        result = _run_lanes(experiment, *args, key, mesh, batch_size=1 if is_cpu else places)
+        mine = {name: value[lane] for name, value in values.items()}
+        args = spread((mine, seeds[lane].astype(np.uint32), lane >= 0), mesh)
+        result = _run_lanes(work, *args, key, mesh, batch_size=1 if is_cpu else places)
         done.append({name: value[lane >= 0] for name, value in gather(result).items()})
         if progress is not None:
             progress(first + len(new), total)
@@ -155,23 +159,28 @@ ONE_THREAD_PER_LANE = {"xla_cpu_multi_thread_eigen": False}
 
 
 @partial(jax.jit, static_argnames=("mesh", "batch_size"), compiler_options=ONE_THREAD_PER_LANE)
-def _run_lanes(experiment, swept, seeds, is_there, key, mesh: Mesh, batch_size: int) -> dict[str, Array]:
+def _run_lanes(work, values, seeds, is_there, key, mesh: Mesh, batch_size: int) -> dict[str, Array]:
     def run_lane(lane):
-        swept, seed, is_there = lane
+        values, seed, is_there = lane
 
-        def work():
-            return run_one(replace_at(experiment, swept), jax.random.fold_in(key, seed))
+        def run():
+            return work(values, jax.random.fold_in(key, seed))
 
         # An empty place costs nothing where lanes run one by one.
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(work))
-        return jax.lax.cond(is_there, work, lambda: nothing)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(run))
+        return jax.lax.cond(is_there, run, lambda: nothing)
 
     def run_part(*lanes):
         return jax.lax.map(run_lane, lanes, batch_size=None if batch_size == 1 else batch_size)
 
     lanes = PartitionSpec("lane")
     # Lanes do not talk to each other, so there is nothing to check of what varies over the mesh.
-    return jax.shard_map(run_part, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)(swept, seeds, is_there)
+    return jax.shard_map(run_part, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)(values, seeds, is_there)
+
+
+def _run_point(experiment: Experiment, swept: dict[str, Array], key: PRNGKeyArray) -> dict[str, Array]:
+    """One run at one point of a sweep."""
+    return run_one(replace_at(experiment, swept), key)
 
 
 def run_one(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Array]:
