@@ -86,12 +86,6 @@ def test_damaged_results_get_one_clear_line(tmp_path, capsys):
     assert_one_line(said(capsys)[1], str(path), "not a readable NetCDF-4 file")
 
 
-def test_who_ends_before_the_other_processes_writes_no_tables(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("vcjax.commands.reproduce", lambda *_, **__: {})
-    assert main(["reproduce", "--out", str(tmp_path)]) == 0
-    assert "others are still at work" in said(capsys)[1] and not list(tmp_path.iterdir())
-
-
 def test_only_the_first_process_saves_the_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("vcjax.commands.monte_carlo", lambda *_, **__: fake_runs(num_seeds=2))
     monkeypatch.setattr(jax, "process_index", lambda: 1)

@@ -13,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from vcjax.devices import Devices, agree
+from vcjax.devices import Devices, together
 from vcjax.filter.config import FilterConfig
 from vcjax.report.figures import write_figures
 from vcjax.report.tables import write_tables
@@ -22,7 +22,7 @@ from vcjax.storage import check_writable, write_file
 from vcjax.study import benchmark
 from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.reproduce import load_results, reproduce
-from vcjax.study.results import save
+from vcjax.study.results import describe, save
 from vcjax.study.summary import summarise
 
 GateName = Literal["RE", "VC"]
@@ -51,21 +51,15 @@ class Reproduce:
     def __call__(self, console: Console) -> None:
         """Run, then report."""
         with _progress(console, "compiling, first cell") as show:
-            results = reproduce(
+            reproduce(
                 self.out,
                 num_seeds=self.seeds,
                 tables=self.tables,
                 key=_key(self.key),
                 progress=lambda done, total, cell: show(done, total, f"table {cell.table}, {cell.case}, {cell.method}"),
             )
-        if results:
+        if jax.process_index() == 0:  # every process has all the runs
             _report(load_results(self.out), self.out, console)
-        else:
-            say(
-                console,
-                "finished; others are still at work, and the last one writes tables and figures. "
-                "If one of them has died, run the same command again.",
-            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,18 +95,16 @@ class Run:
 
     def __call__(self, console: Console) -> None:
         """Run, summarise, save."""
-        refused = None
-        try:
+        with together() as settings:
             check_writable(self.out)
-        except OSError as error:
-            refused = error
-        agree(refused)
+            key = _key(self.key)
+            settings += [describe(self.scenario), describe(self.config), self.seeds, self.key]
         with _progress(console, "running") as show:
-            runs = monte_carlo(self.scenario, self.config, num_seeds=self.seeds, key=_key(self.key), progress=show)
-        if jax.process_index() > 0:  # every process has all the runs
-            return
-        print(summarise(runs))
-        say(console, f"wrote {save(runs, self.out)}")
+            runs = monte_carlo(self.scenario, self.config, num_seeds=self.seeds, key=key, progress=show)
+        with together():
+            if jax.process_index() == 0:  # every process has all the runs
+                print(summarise(runs))
+                say(console, f"wrote {save(runs, self.out)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,11 +137,8 @@ class Bench:
                 print(f"{name:28s} {f'{value:.4g}' if isinstance(value, float) else value}", flush=True)
             if self.json is not None:
                 write_file(self.json, f"{json.dumps(measured, indent=1)}\n".encode())
-        if accepted is not None:
-            worse = benchmark.compare(measured, accepted)
-            say(console, f"compared with {self.baseline}: {', '.join(accepted)}")
-            if worse:
-                raise ValueError("; ".join(worse))
+        if accepted is not None and (worse := benchmark.compare(measured, accepted)):
+            raise ValueError("; ".join(worse))
 
 
 def _key(number: int) -> PRNGKeyArray:

@@ -1,8 +1,11 @@
 """The devices and processes that the work is shared by."""
 
+import contextlib
 import dataclasses
+import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -77,16 +80,16 @@ class Devices:
                 self.coordinator,
                 self.num_processes,
                 self.process_id,
-                # Who is done first waits at its end for the others, however long they take; who dies is found out by
-                # its missing heartbeat.
-                shutdown_timeout_seconds=7 * 24 * 3600,
+                # All end together (see `together`). Where one ends early, something went wrong: the others stop too.
+                shutdown_timeout_seconds=60,
             )
         except (ValueError, TypeError, RuntimeError) as error:
             raise ValueError(
                 f"processes cannot be joined: {error} Start them by SLURM, Open MPI or Kubernetes with --distributed, "
                 "or give each --coordinator HOST:PORT, --num-processes and --process-id."
             ) from None
-        agree(None)
+        with together():
+            pass
 
 
 def meet(devices: Sequence[jax.Device]) -> None:  # pyright: ignore[reportInvalidTypeForm] (jax.Device is untyped)
@@ -98,17 +101,31 @@ def meet(devices: Sequence[jax.Device]) -> None:  # pyright: ignore[reportInvali
         gather(spread(np.arange(len(devices)), Mesh(np.array(devices), ("lane",))))
 
 
-def agree(error: Exception | None) -> None:
-    """Go on only where no process has failed: what one is refused, all are.
+@contextlib.contextmanager
+def together() -> Iterator[list[Any]]:
+    """A part of the work after which all processes go on, or none: what one is refused stops the others too.
+
+    Gives a list for what must be the same in all of them; it is compared, as text, where the part ends, and who is
+    there first waits. A single process does the part and no more.
 
     Raises:
-        Exception: this process's own error, or ValueError where another has one.
+        ValueError, OSError: this process's own, raised in the part; ValueError where another has one, or where they
+            were given different things to do.
     """
+    settings: list[Any] = []
+    error = None
+    try:
+        yield settings
+    except (ValueError, OSError) as refused:
+        error = refused
     if jax.process_count() > 1:
         meet(jax.devices())
-        is_fine = multihost_utils.process_allgather(np.array(error is None))
+        digest = np.frombuffer(hashlib.sha256(repr(settings).encode()).digest(), np.uint8)
+        is_fine, digests = multihost_utils.process_allgather((np.array(error is None), digest))
         if error is None and not np.all(is_fine):
             raise ValueError(f"process {int(np.argmin(is_fine))} was refused, so all stop; see what it says.")
+        if error is None and np.any(digests != digests[0]):
+            raise ValueError("the processes were given different options; give all the same.")
     if error is not None:
         raise error
 

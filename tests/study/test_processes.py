@@ -101,6 +101,13 @@ def test_what_one_process_is_refused_stops_all(tmp_path):
     assert not list((tmp_path / "0").rglob("*.nc"))
 
 
+def test_different_options_are_refused_by_all(tmp_path):
+    script = _REFUSED.replace("num_seeds=1", "num_seeds=1 + number").replace("/{number}", "")
+    for process in start_two(script, tmp_path):
+        assert "the processes were given different options; give all the same" in process.communicate(timeout=600)[0]
+    assert not list(tmp_path.rglob("*.nc"))
+
+
 @pytest.fixture
 def alone(tmp_path, monkeypatch):
     """The same work by one process."""
@@ -117,8 +124,8 @@ def test_each_process_writes_its_part(tmp_path, alone):
             f"{number} 1 2",
             f"{number} 2 2",
         ]
-    found = sorted(int(line.split()[-1]) for lines in told for line in lines if "found" in line)
-    assert found[0] in (0, NUM_CELLS) and found[1] == NUM_CELLS  # who ends last finds all
+    for number, lines in enumerate(told):
+        assert f"{number} found {NUM_CELLS}" in lines  # each waits for the other's part
     results = load_results(tmp_path, tables=(2,))
     for cell, runs in alone.items():
         xr.testing.assert_allclose(results[cell], runs, **ROUNDING)

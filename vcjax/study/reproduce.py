@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PRNGKeyArray
 
-from vcjax.devices import agree
+from vcjax.devices import together
 from vcjax.fields import require_key
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.gate import AbstractGate
@@ -71,33 +71,26 @@ def reproduce(
         key: base key; `jax.random.key(0)` if None.
         progress: called with (blocks done, blocks in all, cell) after each block that this process has to run.
 
-    Returns: the runs of each cell, an `xarray.Dataset` as from `monte_carlo`; nothing yet where other processes
-    are still at work on them.
+    Returns: the runs of each cell, an `xarray.Dataset` as from `monte_carlo`. Of several processes each returns
+    them all, when the last has done its part.
 
     Raises:
         ValueError: for a bad number of seeds or table, or if the directory holds results of other settings (of any
             table: its cells are compared with each other).
         OSError: if the directory cannot be written.
     """
-    if not isinstance(num_seeds, Integral) or num_seeds < 1:
-        raise ValueError(f"reproduce(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
-    if not isinstance(tables, Collection) or not tables:
-        raise ValueError(f"reproduce(tables={tables!r}): give at least one of {TABLES}, in a list.")
     directory, key = Path(directory), jax.random.key(0) if key is None else key
-    require_key("reproduce", key)
-    blocks = _all_blocks(tables, num_seeds)
-    refused = None
-    try:
+    with together() as settings:
+        blocks = _checked(num_seeds, tables, key)
         _prepare(directory, key)
-    except (ValueError, OSError) as error:
-        refused = error
-    agree(refused)
-    mine = _my_part(blocks, _missing(directory, blocks))
-    for done, (cell, first, end) in enumerate(mine, start=1):
-        _run_block(directory / "runs" / cell.identifier, cell, first, end, key)
-        if progress is not None:
-            progress(done, len(mine), cell)
-    return {} if _missing(directory, blocks) else load_results(directory, tables=tables, num_seeds=num_seeds)
+        settings += [blocks, jax.random.key_data(key).tolist()]
+    with together():
+        mine = _my_part(blocks, _missing(directory, blocks))
+        for done, (cell, first, end) in enumerate(mine, start=1):
+            _run_block(directory / "runs" / cell.identifier, cell, first, end, key)
+            if progress is not None:
+                progress(done, len(mine), cell)
+    return load_results(directory, tables=tables, num_seeds=num_seeds)
 
 
 def load_results(
@@ -123,6 +116,16 @@ def load_results(
             f"{directory}: the cells have no seed in common; run `vcjax reproduce` again to complete them."
         )
     return {cell: runs.sel(seed=seeds) for cell, runs in results.items()}
+
+
+def _checked(num_seeds: int, tables: Collection[int], key: PRNGKeyArray) -> list[Block]:
+    """The blocks of arguments that make sense."""
+    if not isinstance(num_seeds, Integral) or num_seeds < 1:
+        raise ValueError(f"reproduce(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
+    if not isinstance(tables, Collection) or not tables:
+        raise ValueError(f"reproduce(tables={tables!r}): give at least one of {TABLES}, in a list.")
+    require_key("reproduce", key)
+    return _all_blocks(tables, num_seeds)
 
 
 def _prepare(directory: Path, key: PRNGKeyArray) -> None:
