@@ -98,8 +98,9 @@ BAD_CONFIGURATIONS = {
     "no detector": (dict(detector=None), r"FilterConfig\(detector=None\): give a detector, e.g. InlierRatio\(\)"),
     **{
         f"{name} a word": (dict([(name, "no")]), rf"FilterConfig\({name}='no'\): choose one of \(True, False\)")
-        for name in ("retire", "skip_free_slots", "reverse_mode", "toolbox_parity")
+        for name in ("retire", "reverse_mode", "toolbox_parity")
     },
+    "skip_free_slots a word": (dict(skip_free_slots="no"), r"choose one of \(None, True, False\)"),
     "many pixel noises": (
         dict(pixel_std_px=np.ones(3)),
         r"FilterConfig\(pixel_std_px\) has shape \(3,\), but one number is needed: .* `sweep` of `monte_carlo`",

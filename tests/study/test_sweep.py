@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tiny_runs
+from jax.tree_util import Partial
 from tiny_runs import NUM_SEEDS, assert_same_runs, compilations
 
 import vcjax as vc
@@ -115,7 +116,8 @@ def test_lanes_get_their_own_values_and_seeds(monkeypatch):
     monkeypatch.setattr(
         module, "run_one", lambda point, key: {"std": point.scenario.odometry_std, "key": jax.random.key_data(key)}
     )
-    lanes = module.run_lanes(experiment(), {"scenario.odometry_std.5": np.array([0.1, 0.2])}, np.array([4, 9]), KEY)
+    work = Partial(module._run_point, experiment())
+    lanes = module.run_lanes(work, {"scenario.odometry_std.5": np.array([0.1, 0.2])}, np.array([4, 9]), KEY)
     np.testing.assert_array_equal(lanes["std"], [[0.005, 0.005, 0, 0, 0, 0.1], [0.005, 0.005, 0, 0, 0, 0.2]])
     np.testing.assert_array_equal(lanes["key"], [jax.random.key_data(jax.random.fold_in(KEY, i)) for i in (4, 9)])
 
