@@ -58,8 +58,9 @@ class Reproduce:
                 key=_key(self.key),
                 progress=lambda done, total, cell: show(done, total, f"table {cell.table}, {cell.case}, {cell.method}"),
             )
-        if jax.process_index() == 0:  # every process has all the runs
-            _report(load_results(self.out), self.out, console)
+        with together():
+            if jax.process_index() == 0:  # every process has all the runs
+                _report(load_results(self.out), self.out, console)
 
 
 @dataclasses.dataclass(frozen=True)
