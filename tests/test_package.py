@@ -15,8 +15,9 @@ import vcjax
 PACKAGE = Path(vcjax.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# Imports run one way: a room may use those named here and itself, and no other. The first two are below everything.
+# Imports run one way: a room may use those named here and itself, and no other. The first three are below everything.
 ROOMS = {
+    "extras": set(),
     "fields": set(),
     "storage": set(),
     "models": {"fields"},
@@ -26,9 +27,20 @@ ROOMS = {
     "filter": {"fields", "models", "recording", "ekf", "gates"},
     "simulation": {"fields", "models", "recording"},
     "devices": set(),
-    "sources": {"fields", "storage", "models", "recording", "simulation"},
+    "sources": {"extras", "fields", "storage", "models", "recording", "simulation"},
     "study": (
-        below_study := {"fields", "storage", "models", "recording", "ekf", "gates", "filter", "simulation", "devices"}
+        below_study := {
+            "extras",
+            "fields",
+            "storage",
+            "models",
+            "recording",
+            "ekf",
+            "gates",
+            "filter",
+            "simulation",
+            "devices",
+        }
     ),
     "report": below_study | {"study"},
     "commands": below_study | {"study", "report"},

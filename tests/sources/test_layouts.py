@@ -1,37 +1,15 @@
 """Layouts of data sets: small ones made here are read as they were meant, bad ones refused by file and line."""
 
-import dataclasses
-
 import cv2
 import numpy as np
 import pytest
+from pictures import CALIBRATION, picture, poses_at, write_images
 from scipy.spatial.transform import Rotation
 
-from vcjax.sources.calibration import Calibration, write_calibration
-from vcjax.sources.image_sequence import ImageSequence, PoseTruth, interpolated, record
+from vcjax.sources.calibration import write_calibration
 from vcjax.sources.layouts import euroc, kitti_odometry, plain_folder, tum_rgbd
 from vcjax.sources.table_file import write_table
 from vcjax.sources.trajectory_file import write_kitti, write_tum
-
-CALIBRATION = Calibration(64, 48, 50.0, 51.0, 32.0, 24.0)
-
-
-def picture(t, shape=(48, 64), dtype=np.uint8):
-    """A picture of its own for each frame."""
-    noise = np.random.default_rng(t).integers(0, 256, shape)
-    return (noise * (257 if dtype == np.uint16 else 1)).astype(dtype)
-
-
-def write_images(paths, **options):
-    for t, path in enumerate(paths):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(cv2.imencode(path.suffix, picture(t, **options))[1].tobytes())
-
-
-def poses_at(time_s):
-    """A screw: 1 m/s along x, a turn of 0.5 rad/s about z."""
-    turn = Rotation.from_rotvec(np.outer(time_s, [0, 0, 0.5]))
-    return np.column_stack([time_s, 0 * time_s, 0 * time_s, turn.as_quat(scalar_first=True)])
 
 
 @pytest.fixture
@@ -233,69 +211,3 @@ def test_folders_without_what_is_needed(tmp_path):
         tum_rgbd(tmp_path, CALIBRATION)
     with pytest.raises(FileNotFoundError, match=r"cam0/data\.csv: no such file"):
         euroc(tmp_path)
-
-
-def test_images_of_changing_size_are_refused_by_file(tmp_path):
-    write_images([tmp_path / f"{t}.png" for t in range(3)])
-    write_images([tmp_path / "x" / "0.png"], shape=(48, 65))
-    (tmp_path / "x" / "0.png").rename(tmp_path / "1.png")
-    with pytest.raises(ValueError, match=r"1\.png: 65 × 48 pixels, but the calibration is of 64 × 48"):
-        record(plain_folder(tmp_path, CALIBRATION, 10.0))
-
-
-def test_bad_images_are_refused_by_file(tmp_path):
-    write_images([tmp_path / "0.png"])
-    sequence = plain_folder(tmp_path, CALIBRATION, 10.0)
-    whole = sequence.paths[0].read_bytes()
-    for content, message in (
-        (b"", r"0\.png: no image that can be read"),
-        (b"hello", r"0\.png: no image that can be read"),
-        (whole[:200], r"0\.png: the image is damaged"),
-    ):
-        sequence.paths[0].write_bytes(content)
-        with pytest.raises(ValueError, match=message):
-            sequence.read(0)
-    sequence.paths[0].unlink()
-    with pytest.raises(FileNotFoundError, match=r"0\.png: no such image"):
-        sequence.read(0)
-
-
-def test_image_that_states_a_huge_size_is_not_decoded(tmp_path):
-    write_images([tmp_path / "0.png"])
-    path = tmp_path / "0.png"
-    content = bytearray(path.read_bytes())
-    content[16:24] = (30_000).to_bytes(4, "big") * 2
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"0\.png: (30000 × 30000 pixels, but|no image that can be read)"):
-        plain_folder(tmp_path, CALIBRATION, 10.0).read(0)
-
-
-@pytest.mark.parametrize("options", [{"dtype": np.uint16}, {"shape": (48, 64, 3)}, {"shape": (48, 64, 4)}])
-def test_deep_and_coloured_images_become_grey(tmp_path, options):
-    write_images([tmp_path / "0.png"], **options)
-    image = plain_folder(tmp_path, CALIBRATION, 10.0).read(0)
-    assert image.dtype == np.uint8 and image.shape == (48, 64)
-    if "dtype" in options:
-        np.testing.assert_allclose(image.astype(int), picture(0), atol=1)
-
-
-def test_truth_between_its_poses():
-    known = np.array([0.0, 1.0, 2.0, 9.0])
-    truth = PoseTruth(known, poses_at(known), "robot")
-    at = np.array([-0.1, 0.0, 0.25, 1.5, 5.0, 9.0, 9.1])
-    found = interpolated(truth, at, 1.0)
-    is_known = np.array([False, True, True, True, False, True, False])
-    expected = poses_at(at[is_known])
-    np.testing.assert_allclose(found[is_known, :3], expected[:, :3], atol=1e-12)
-    same = np.abs(np.sum(found[is_known, 3:] * expected[:, 3:], axis=1))  # q and -q are one rotation
-    np.testing.assert_allclose(same, 1.0, atol=1e-12)
-    assert np.all(np.isnan(found[~is_known]))
-
-
-def test_sequences_that_do_not_fit_are_refused(tmp_path):
-    paths = (tmp_path / "a.png", tmp_path / "b.png")
-    with pytest.raises(ValueError, match="2 images, but 3 times"):
-        ImageSequence(paths, np.arange(3.0), CALIBRATION)
-    with pytest.raises(ValueError, match=r"0\.0 s, of .*b\.png, is not above"):
-        ImageSequence(paths, np.zeros(2), CALIBRATION)
-    assert dataclasses.replace(CALIBRATION, width=65) != CALIBRATION

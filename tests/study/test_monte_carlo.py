@@ -135,9 +135,12 @@ def test_seeds_are_paired_across_gates_scenes_and_cameras():
 
 def test_births_in_random_order_do_not_reuse_the_keys_of_the_noise(monkeypatch):
     seen = []
-    monkeypatch.setattr(module, "simulate", lambda scenario, key: (None, None))
-    monkeypatch.setattr(module, "run", lambda config, recording, key: (None, seen.append(key)))
-    monkeypatch.setattr(module, "run_metrics", lambda info, truth: {})
+
+    def run(config, recording, key):
+        seen.append(key)
+        return vc.run(config, recording, key)
+
+    monkeypatch.setattr(module, "run", run)
     run_one(Experiment(tiny_runs.scenario(), tiny_runs.config(birth_order="random")), KEY)
     run_one(Experiment(tiny_runs.scenario(), tiny_runs.config()), KEY)
     birth_key, nothing = seen

@@ -124,7 +124,6 @@ def test_each_process_writes_its_part(tmp_path, alone):
             f"{number} 1 2",
             f"{number} 2 2",
         ]
-    for number, lines in enumerate(told):
         assert f"{number} found {NUM_CELLS}" in lines  # each waits for the other's part
     results = load_results(tmp_path, tables=(2,))
     for cell, runs in alone.items():

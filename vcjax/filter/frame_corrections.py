@@ -86,11 +86,13 @@ def correct_frame(
     if config.smoothing == "hard":
         p_dynamic = is_dynamic.astype(uv_px.dtype)
     else:
-        p_dynamic = jnp.where(is_measured, 1.0 - soft_weight(config, margin, verdict), 0.0)
+        p_dynamic = jnp.where(is_measured, 1.0 - _soft_weight(config, margin, verdict), 0.0)
     return submap, Outcome(innovation, verdict, is_accepted, is_recovered, is_dynamic, p_dynamic)
 
 
-def soft_weight(config: FilterConfig, margin: Float[Array, "*b"], verdict: Verdict | None = None) -> Float[Array, "*b"]:
+def _soft_weight(
+    config: FilterConfig, margin: Float[Array, "*b"], verdict: Verdict | None = None
+) -> Float[Array, "*b"]:
     """To what degree a candidate corrects the state: a, accepted; with a verdict, a + (1 - a) r, recovered if not."""
     accepted = decide("soft", margin, config.temperature)
     if verdict is None:
@@ -145,10 +147,10 @@ def _correct_recovered(
     weight, is_judged = verdict.is_recovered.astype(uv_px.dtype), ~jnp.isnan(verdict.margin)
     if config.smoothing == "soft":
         is_used, first = is_judged, num_candidates
-        weight = soft_weight(config, margin, verdict) - soft_weight(config, margin)
+        weight = _soft_weight(config, margin, verdict) - _soft_weight(config, margin)
     elif config.smoothing == "straight_through":
         # A weight of zero has a derivative: the dynamic ones are passed through as well.
-        is_used, weight = is_isolated & is_judged, straight_through(weight, soft_weight(config, margin, verdict))
+        is_used, weight = is_isolated & is_judged, straight_through(weight, _soft_weight(config, margin, verdict))
     else:
         is_used = is_isolated & verdict.is_recovered
     weight = jnp.where(is_used, weight, 0.0)

@@ -24,9 +24,9 @@ class FrameInfo(eqx.Module):
     re1: Float[Array, " K"]
     """RE₁ as gated. Equation (13)."""
     re1_prior: Float[Array, " K"]
-    """RE₁ at the gate's prior, of the isolated; NaN elsewhere."""
+    """RE₁ at the gate's prior, of the isolated (with smoothing of all measured); NaN elsewhere."""
     re2: Float[Array, " K"]
-    """RE₂ of the isolated; NaN elsewhere. Equation (14)."""
+    """RE₂ of the same. Equation (14)."""
     is_accepted: Bool[Array, " K"]
     """Corrected with directly."""
     is_recovered: Bool[Array, " K"]

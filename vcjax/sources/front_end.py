@@ -11,11 +11,11 @@ which is what the gates are to find.
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from vcjax import extras
 from vcjax.sources.tracks import Tracks
 
 Image = UInt8[np.ndarray, "height width"]
@@ -102,7 +102,7 @@ def _follow(
     before: Image, image: Image, points: Float[np.ndarray, "n 2"], options: FrontEnd
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
     """Where points have moved, and which of them came back, stayed inside the image and have a texture still."""
-    cv2 = _opencv()
+    cv2 = extras.load("cv2", "Images", "images")
     settings = {
         "winSize": (options.window_px, options.window_px),
         "maxLevel": options.num_levels,
@@ -124,7 +124,7 @@ def _apart(points: Float[np.ndarray, "n 2"], distance_px: float) -> Bool[np.ndar
 
 def _corners(image: Image, points: Float[np.ndarray, "n 2"], options: FrontEnd) -> Float[np.ndarray, "m 2"]:
     """New corners: the best of each cell that has places left, apart from the points that there are."""
-    cv2 = _opencv()
+    cv2 = extras.load("cv2", "Images", "images")
     num_free = options.max_features - len(points)
     if num_free <= 0:
         return np.zeros((0, 2), np.float32)
@@ -175,16 +175,3 @@ def _refuse_image(image: Image, frame: int, before: Image | None) -> None:
 def _require(owner: FrontEnd, name: str, condition: bool, remedy: str) -> None:
     if not condition:
         raise ValueError(f"FrontEnd({name}={getattr(owner, name)!r}): {remedy}")
-
-
-def _opencv() -> Any:
-    """OpenCV, an optional dependency.
-
-    Raises:
-        ModuleNotFoundError: if it is not installed, with the remedy.
-    """
-    try:
-        import cv2
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("Images need OpenCV: pip install 'vcjax[images]'.") from error
-    return cv2

@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from vcjax import extras
 from vcjax.storage import replacing
 
 Kind = Literal["whole", "real"]
@@ -70,7 +71,7 @@ def read_table(path: str | os.PathLike, kinds: Mapping[str, Kind], optional: Seq
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file.")
     read = _read_parquet if _is_parquet(path) else _read_csv
-    arrow = _arrow()
+    arrow = extras.load("pyarrow", "Tables", "images")
     try:
         columns = read(path, kinds, optional)
     except (arrow.ArrowException, UnicodeDecodeError) as error:
@@ -89,10 +90,11 @@ def write_table(path: str | os.PathLike, columns: Mapping[str, Any]) -> Path:
         ValueError: for another ending.
         OSError: if the place cannot be written; what was there before stays.
     """
+    arrow = extras.load("pyarrow", "Tables", "images")
     import pyarrow.csv
     import pyarrow.parquet
 
-    table = _arrow().table({name: np.asarray(column) for name, column in columns.items()})
+    table = arrow.table({name: np.asarray(column) for name, column in columns.items()})
     write: Any = pyarrow.parquet.write_table if _is_parquet(Path(path)) else pyarrow.csv.write_csv
     with replacing(path) as temporary:
         write(table, temporary)
@@ -109,7 +111,7 @@ def _is_parquet(path: Path) -> bool:
 def _read_csv(path: Path, kinds: Mapping[str, Kind], optional: Sequence[str]) -> dict[str, np.ndarray]:
     import pyarrow.csv as arrow_csv
 
-    arrow = _arrow()
+    arrow = extras.load("pyarrow", "Tables", "images")
     with path.open("rb") as file:
         line = file.readline(_MAX_HEADER_BYTES)
     names = [name.strip() for name in next(csv.reader([line.decode("utf-8-sig")]), [])]
@@ -148,7 +150,7 @@ def _csv_refusal(path: Path, message: str, names: list[str], kinds: Mapping[str,
 def _read_parquet(path: Path, kinds: Mapping[str, Kind], optional: Sequence[str]) -> dict[str, np.ndarray]:
     import pyarrow.parquet as parquet
 
-    arrow = _arrow()
+    arrow = extras.load("pyarrow", "Tables", "images")
     with parquet.ParquetFile(path) as file:
         if file.metadata.num_rows > MAX_ROWS:
             raise ValueError(f"{path}: {file.metadata.num_rows} rows, more than {MAX_ROWS}; split the file.")
@@ -183,16 +185,3 @@ def _choose(path: Path, names: Sequence[str], kinds: Mapping[str, Kind], optiona
 
 def _first_line(error: object) -> str:
     return str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-
-
-def _arrow() -> Any:
-    """Apache Arrow, an optional dependency.
-
-    Raises:
-        ModuleNotFoundError: if it is not installed, with the remedy.
-    """
-    try:
-        import pyarrow
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("Tables need pyarrow: pip install 'vcjax[images]'.") from error
-    return pyarrow

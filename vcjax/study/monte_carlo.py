@@ -21,7 +21,9 @@ from jaxtyping import Array, PRNGKeyArray
 from vcjax.devices import gather, meet, spread
 from vcjax.fields import require_key, require_kind, require_single
 from vcjax.filter.config import FilterConfig, check_arguments
+from vcjax.filter.info import FrameInfo
 from vcjax.filter.slam import run
+from vcjax.recording import Truth
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import simulate
 from vcjax.study.metrics import run_metrics
@@ -185,8 +187,13 @@ def _run_point(experiment: Experiment, swept: dict[str, Array], key: PRNGKeyArra
 
 def run_one(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Array]:
     """One run: simulate, filter, compare with the truth. Pure; the function to differentiate or to batch otherwise."""
+    return run_metrics(*simulate_and_filter(experiment, key))
+
+
+def simulate_and_filter(experiment: Experiment, key: PRNGKeyArray) -> tuple[FrameInfo, Truth]:
+    """One run, with every frame's info and the truth beside it. Pure."""
     recording, truth = simulate(experiment.scenario, key)
     # Births in random order draw from a key of their own; `simulate` splits the key, which uses up its folds 0 and 1.
     birth_key = jax.random.fold_in(key, 2) if experiment.config.birth_order == "random" else None
     _, info = run(experiment.config, recording, birth_key)
-    return run_metrics(info, truth)
+    return info, truth

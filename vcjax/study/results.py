@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from vcjax import extras
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import simulate
 from vcjax.storage import replacing
@@ -188,8 +189,4 @@ def import_xarray() -> Any:
     Raises:
         ModuleNotFoundError: if it is not installed, with the remedy.
     """
-    try:
-        import xarray
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("Labelled results need xarray: pip install 'vcjax[study]'.") from error
-    return xarray
+    return extras.load("xarray", "Labelled results", "study")

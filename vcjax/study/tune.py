@@ -20,12 +20,10 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from vcjax.fields import number, require, require_count, require_key, require_kind
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.slam import run
 from vcjax.simulation.scenarios import Scenario
-from vcjax.simulation.simulate import simulate
 from vcjax.study.intervals import Interval
 from vcjax.study.losses import Objective
-from vcjax.study.monte_carlo import run_lanes
+from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
 from vcjax.study.sweep import Experiment, numeric_paths, replace_at
 
 
@@ -121,9 +119,9 @@ def tune(
     state, history = optimiser.init(jnp.asarray(free)), []
     lanes = {"scene": np.repeat(np.arange(len(scenarios)), schedule.seeds_per_step)}
     seeds = np.tile(np.arange(schedule.seeds_per_step), len(scenarios))
+    problem = Problem(scenes, config, objective, tuple(parameters), tuple(parameters.values()))
     for k in range(schedule.num_steps):
         temperature = schedule.temperature(k)
-        problem = Problem(scenes, config, objective, tuple(parameters), tuple(parameters.values()))
         work = Partial(_value_and_gradient, problem, jnp.asarray(free), jnp.asarray(temperature))
         runs = run_lanes(work, lanes, seeds, jax.random.fold_in(key, k))
         step, gradient = _average(runs, _parameters(parameters, free), temperature)
@@ -159,9 +157,7 @@ def _value_and_gradient(
         values = {path: interval.to_parameter(x) for path, interval, x in intervals}
         config = eqx.tree_at(lambda c: c.temperature, problem.config, temperature)
         experiment = replace_at(Experiment(scenario, config), values)
-        recording, truth = simulate(experiment.scenario, key)
-        _, info = run(experiment.config, recording)
-        value = problem.objective(experiment.scenario, info, truth)
+        value = problem.objective(experiment.scenario, *simulate_and_filter(experiment, key))
         return value, value
 
     gradient, value = jax.jacfwd(loss, has_aux=True)(free)
