@@ -38,7 +38,7 @@ import numpy as np
 from IPython.display import Image, display
 
 import vcjax as vc
-from vcjax.report.figures import write_figures
+from vcjax.report.paper_figures import write_figures
 from vcjax.study.paper import Cell
 from vcjax.study.summary import paired_difference
 

@@ -74,6 +74,13 @@ def fake_runs(cell: Cell | None = None, num_seeds: int = 4, num_frames: int = 20
             "dynamic_deletions": (("seed", "feature"), dynamic_deletions),
             "inconsistent_deletions": (("seed", "feature"), inconsistent_deletions),
             "frames_mapped": (("seed", "feature"), np.full((num_seeds, len(features)), num_frames)),
+            "first_mapped": (("seed", "feature"), np.ones((num_seeds, len(features)), int)),
+            "first_deleted": (
+                ("seed", "feature"),
+                np.where(dynamic_deletions + inconsistent_deletions > 0, num_frames // 2, 0),
+            ),
+            "dynamic_margin": (("seed", "feature"), dynamic_deletions - 0.5),
+            "detection_auc": ("seed", np.full(num_seeds, 0.75 if is_moving.any() else np.nan)),
             "is_moving": ("feature", is_moving),
             "is_finite": ("seed", np.ones(num_seeds, bool)),
             "map_full_frames": ("seed", np.zeros(num_seeds, int)),

@@ -33,7 +33,7 @@ def test_gate_is_the_last_one_named(options, gate, th1, tmp_path, monkeypatch, c
         seen.append(config)
         return fake_runs(num_seeds=2)
 
-    monkeypatch.setattr("vcjax.commands.monte_carlo", monte_carlo)
+    monkeypatch.setattr("vcjax.commands.run.monte_carlo", monte_carlo)
     assert main(["run", *options]) == 0
     assert type(seen[0].gate).__name__ == gate and seen[0].gate.th1 == th1
     assert len(list(tmp_path.rglob("*"))) >= 1
@@ -42,7 +42,7 @@ def test_gate_is_the_last_one_named(options, gate, th1, tmp_path, monkeypatch, c
 def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
     seen = []
     monkeypatch.setattr(
-        "vcjax.commands.monte_carlo", lambda *given, **more: seen.append((*given, more)) or fake_runs(num_seeds=2)
+        "vcjax.commands.run.monte_carlo", lambda *given, **more: seen.append((*given, more)) or fake_runs(num_seeds=2)
     )
     options = "--robot curved --dynamic-set 3 4 5 --noise six_axis --pixel-error-std-px 0.5 --pixel-std-px 2 "
     options += "--min-searches 7 --no-retire --update stacked --prior predicted --th2 0"
@@ -57,7 +57,9 @@ def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
 
 def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsys):
     seen = []
-    monkeypatch.setattr("vcjax.commands.monte_carlo", lambda *given, **_: seen.append(given) or fake_runs(num_seeds=2))
+    monkeypatch.setattr(
+        "vcjax.commands.run.monte_carlo", lambda *given, **_: seen.append(given) or fake_runs(num_seeds=2)
+    )
     options = "--start 1 2 30 --increment 0.1 0 -1 --odometry-std 1 2 3 4 5 6 --mount 0 0 1 -80 0 -90 "
     options += "--intrinsics-px 300 200 250 251 --image-size-px 600 400 --distortion 0.1 -0.02 "
     options += "--grid-low-m -4 --grid-high-m 4 --grid-per-side 5 --grid-heights-m 0.5 --dynamic-direction 1 0 1 "
@@ -169,7 +171,7 @@ def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path)
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vcjax.commands.reproduce", interrupt)
+    monkeypatch.setattr("vcjax.commands.paper.reproduce", interrupt)
     assert main(["reproduce", "--out", str(tmp_path)]) == 130
     assert "stopped; what `vcjax reproduce` has finished is on disk" in said(capsys)[1]
 

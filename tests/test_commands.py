@@ -87,7 +87,7 @@ def test_damaged_results_get_one_clear_line(tmp_path, capsys):
 
 
 def test_only_the_first_process_saves_the_runs(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("vcjax.commands.monte_carlo", lambda *_, **__: fake_runs(num_seeds=2))
+    monkeypatch.setattr("vcjax.commands.run.monte_carlo", lambda *_, **__: fake_runs(num_seeds=2))
     monkeypatch.setattr(jax, "process_index", lambda: 1)
     assert main(["run", "--out", str(tmp_path / "runs.nc")]) == 0
     assert said(capsys)[0] == "" and not list(tmp_path.iterdir())

@@ -19,7 +19,7 @@ from vcjax.study import monte_carlo as module
 from vcjax.study import reproduce
 from vcjax.study.paper import Cell, cells
 from vcjax.study.reproduce import cell_experiment
-from vcjax.study.results import PER_FEATURE, PER_FRAME, PER_RUN
+from vcjax.study.results import RUN_VARIABLES
 from vcjax.study.sweep import Experiment
 
 NUM_SEEDS = 3
@@ -30,7 +30,7 @@ MOVERS = [21, 23, 30, 32, 102, 104]
 NUM_CELLS = 4
 """Those that `make_tiny` leaves of the paper's."""
 CAPACITIES = {"max_landmarks": 24, "max_updates": 6}
-MEASURES = (*PER_FRAME, *PER_FEATURE, *PER_RUN, "robot", "is_moving")
+MEASURES = RUN_VARIABLES
 """All that a run is reduced to."""
 # Thresholds so low that a few frames hold recovered, dynamic and inconsistent features.
 STRICT = VirtualCorrection(th1=1.0, th2=0.7)

@@ -11,7 +11,12 @@ import jax
 import tyro
 from rich.console import Console
 
-from vcjax.commands import Bench, Report, Reproduce, Run, say
+from vcjax.commands.bench import Bench
+from vcjax.commands.console import say
+from vcjax.commands.paper import Report, Reproduce
+from vcjax.commands.run import Run
+from vcjax.commands.sweep import Sweep
+from vcjax.commands.tune import Tune
 from vcjax.filter.config import FilterConfig
 from vcjax.study.reproduce import GATES
 
@@ -38,12 +43,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say(console, f"vcjax: another process has stopped or is late ({str(error).splitlines()[0]}).", style="bold red")
         return 1
     except KeyboardInterrupt:
-        say(console, "vcjax: stopped; what `vcjax reproduce` has finished is on disk, and it will go on from there.")
+        say(
+            console,
+            "vcjax: stopped; what `reproduce`, `tune` and `sweep` have finished is on disk, and they go on there.",
+        )
         return 130
     return 0
 
 
-def _parse(arguments: list[str]) -> Reproduce | Report | Run | Bench:
+def _parse(arguments: list[str]) -> Reproduce | Report | Run | Tune | Sweep | Bench:
     """The command with its options. The gate's own options depend on the gate, so that is looked up first."""
     gate = _gate_name(arguments)
     default = Run(scenario=tyro.MISSING, config=FilterConfig(gate=GATES[gate]()))
@@ -51,6 +59,8 @@ def _parse(arguments: list[str]) -> Reproduce | Report | Run | Bench:
         Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
         | Annotated[Report, tyro.conf.subcommand("report")]
         | Annotated[Run, tyro.conf.subcommand("run", default=default)]
+        | Annotated[Tune, tyro.conf.subcommand("tune")]
+        | Annotated[Sweep, tyro.conf.subcommand("sweep")]
         | Annotated[Bench, tyro.conf.subcommand("bench")]
     )
     told = io.StringIO()

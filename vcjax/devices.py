@@ -15,11 +15,36 @@ from jaxtyping import Array, PyTree
 
 
 @dataclasses.dataclass(frozen=True)
-class Devices:
-    """Where the work is done: all cores or accelerators of this machine, alone or together with other processes."""
+class Cores:
+    """Where the work is done: all cores or accelerators of this machine."""
 
     devices: int | None = None
     """CPU devices to share the runs; all cores if not given."""
+
+    def start(self) -> None:
+        """Switch on float64 and take as many CPU devices as there are cores.
+
+        Raises:
+            ValueError: for devices that cannot be had.
+        """
+        jax.config.update("jax_enable_x64", True)
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        if self.devices is not None and self.devices < 1:
+            raise ValueError(f"--devices {self.devices}: give at least one device.")
+        try:
+            jax.config.update("jax_num_cpu_devices", self.devices or cores)
+        except RuntimeError:  # called from a program in which JAX is at work already: its devices are what there is
+            present = jax.local_device_count()
+            if self.devices not in (None, present):
+                raise ValueError(
+                    f"--devices {self.devices}: JAX already runs in this process, with {present}."
+                ) from None
+
+
+@dataclasses.dataclass(frozen=True)
+class Devices(Cores):
+    """Where the work is done: all cores or accelerators of this machine, alone or together with other processes."""
+
     distributed: bool = False
     """Share the runs with the other processes of this job, which SLURM, Open MPI or Kubernetes started; processes that
     are started by hand are given the next three options instead."""
@@ -36,8 +61,7 @@ class Devices:
         Raises:
             ValueError: for devices or processes that cannot be had.
         """
-        jax.config.update("jax_enable_x64", True)
-        self._take_cores()
+        super().start()
         if self.distributed or self._is_by_hand():
             self._join()
 
@@ -57,19 +81,6 @@ class Devices:
                 "one to each process."
             )
         return True
-
-    def _take_cores(self) -> None:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        if self.devices is not None and self.devices < 1:
-            raise ValueError(f"--devices {self.devices}: give at least one device.")
-        try:
-            jax.config.update("jax_num_cpu_devices", self.devices or cores)
-        except RuntimeError:  # called from a program in which JAX is at work already: its devices are what there is
-            present = jax.local_device_count()
-            if self.devices not in (None, present):
-                raise ValueError(
-                    f"--devices {self.devices}: JAX already runs in this process, with {present}."
-                ) from None
 
     def _join(self) -> None:
         """Become one of several processes, by JAX's own means."""

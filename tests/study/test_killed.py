@@ -13,7 +13,7 @@ import pytest
 import tiny_runs
 from tiny_runs import NUM_CELLS, NUM_SEEDS, make_tiny
 
-from vcjax.report.tables import write_tables
+from vcjax.report.paper_tables import write_tables
 from vcjax.study import reproduce as module
 from vcjax.study.results import load
 
@@ -31,7 +31,7 @@ jax.config.update("jax_compilation_cache_dir", cache)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 from pytest import MonkeyPatch
 from tiny_runs import NUM_SEEDS, make_tiny
-from vcjax.report.tables import write_tables
+from vcjax.report.paper_tables import write_tables
 from vcjax.study import reproduce as module
 make_tiny(MonkeyPatch())
 module.SEEDS_PER_BLOCK = NUM_SEEDS

@@ -32,7 +32,7 @@ IS_MOVING = np.array([True, True, False, False, True])  # the last is never seen
 NUM_FRAMES, NUM_CANDIDATES = IDS.shape
 
 
-def info(p=P, error_m=0.1, variance_m2=0.01) -> FrameInfo:
+def info(p=P, error_m=0.1, variance_m2=0.01, inconsistent_id=((-1,),) * NUM_FRAMES) -> FrameInfo:
     """A made-up run of three frames; what the losses do not read is empty."""
     vehicle = np.zeros((NUM_FRAMES, 14))
     vehicle[:, 0], vehicle[:, [3, 10]] = error_m, 1.0
@@ -45,6 +45,7 @@ def info(p=P, error_m=0.1, variance_m2=0.01) -> FrameInfo:
             candidate_id=jnp.asarray(IDS),
             is_measured=jnp.asarray(IS_MEASURED),
             p_dynamic=jnp.asarray(p),
+            inconsistent_id=jnp.asarray(inconsistent_id),
         )
     )
 
@@ -68,6 +69,13 @@ def test_a_track_is_called_dynamic_at_least_once(unchecked):
     np.testing.assert_array_equal(found.is_mover, [True, True, False, False, False])
     expected = [1 - 0.8 * 0.5, 1 - 0.1 * 0.5 * 1.0, 0.1, 1.0, 0.0]
     np.testing.assert_allclose(found.p, expected, atol=2e-9)
+
+
+def test_a_track_that_the_detector_deletes_is_called_dynamic(unchecked):
+    found = tracks(info(inconsistent_id=((-1,), (2,), (4,))), truth())
+    np.testing.assert_array_equal(found.counts, [True] * 5)
+    np.testing.assert_array_equal(found.is_mover, IS_MOVING)
+    np.testing.assert_allclose(found.p[jnp.array([2, 4])], 1.0, rtol=0)
 
 
 LABELLED = st.integers(1, 12).flatmap(

@@ -27,6 +27,10 @@ def tiny_runs() -> xr.Dataset:
             "num_inconsistent": (frames, [[0, 2], [0, 0]]),
             "dynamic_deletions": (("seed", "feature"), [[3, 0, 0], [1, 1, 0]]),
             "inconsistent_deletions": (("seed", "feature"), [[1, 0, 1], [0, 0, 0]]),
+            "first_mapped": (("seed", "feature"), [[1, 1, 3], [2, 1, 1]]),
+            "first_deleted": (("seed", "feature"), [[5, 0, 9], [3, 9, 0]]),
+            "dynamic_margin": (("seed", "feature"), [[2.0, -1.0, 1.0], [2.0, np.nan, np.nan]]),
+            "detection_auc": ("seed", [0.5, 1.0]),
             "is_moving": ("feature", [True, True, False]),
             "is_finite": ("seed", [True, True]),
             "map_full_frames": ("seed", [0, 2]),
@@ -46,6 +50,9 @@ def test_per_run_equals_numbers_by_hand():
         "inconsistent_deletions_per_run": [2, 0],
         "dynamic_found_per_run": [1, 2],
         "static_deleted_per_run": [1, 0],
+        "detection_f1": [2 * 1 / (2 * 1 + 1 + 1), 1.0],
+        "detection_auc": [0.5, 1.0],
+        "detection_delay_frames": [4.0, (1 + 8) / 2],
         "anees_position": [1.0, 3.0],
         "anees_pose": [1.0, 3.0],
         "nis": [2.0, 2.0],
@@ -117,7 +124,7 @@ def test_one_seed_has_a_mean_and_no_error():
     runs = fake_runs(num_seeds=1)
     summary = summarise(runs)
     for name in FIGURES:
-        assert summary[name].sel(statistic="mean") == per_run(runs)[name][0]
+        np.testing.assert_array_equal(summary[name].sel(statistic="mean"), per_run(runs)[name][0])
         assert np.isnan(summary[name].sel(statistic="se"))
     difference = paired_difference(runs, runs)
     assert difference.nis.sel(statistic="mean") == 0 and np.isnan(difference.nis.sel(statistic="lower"))

@@ -27,6 +27,8 @@ class Outcome(NamedTuple):
     is_accepted: Bool[Array, " K"]
     is_recovered: Bool[Array, " K"]
     is_dynamic: Bool[Array, " K"]
+    dynamic_margin: Float[Array, " K"]
+    """By how much a candidate passes what keeps it from being called dynamic, χ²; NaN where not measured."""
     p_dynamic: Float[Array, " K"]
     """Soft: to what degree a candidate is neither accepted nor recovered."""
 
@@ -83,11 +85,14 @@ def correct_frame(
     submap, verdict = jax.lax.cond(jnp.any(is_judged), judge, judge_nobody, submap)
     is_recovered, is_dynamic = is_isolated & verdict.is_recovered, is_isolated & verdict.is_dynamic
     submap = eqx.tree_at(lambda s: s.is_corrected, submap, is_accepted | is_recovered)
+    # A gate without verdicts has none to add to the margin by which it leaves out.
+    dynamic_margin = jnp.where(is_isolated, jnp.fmin(-margin, verdict.margin), -margin)
+    dynamic_margin = jnp.where(is_measured, dynamic_margin, jnp.nan)
     if config.smoothing == "hard":
         p_dynamic = is_dynamic.astype(uv_px.dtype)
     else:
         p_dynamic = jnp.where(is_measured, 1.0 - _soft_weight(config, margin, verdict), 0.0)
-    return submap, Outcome(innovation, verdict, is_accepted, is_recovered, is_dynamic, p_dynamic)
+    return submap, Outcome(innovation, verdict, is_accepted, is_recovered, is_dynamic, dynamic_margin, p_dynamic)
 
 
 def _soft_weight(

@@ -33,6 +33,10 @@ class FrameInfo(eqx.Module):
     """Isolated, then corrected with."""
     is_dynamic: Bool[Array, " K"]
     """Isolated, called dynamic by the gate and deleted."""
+    dynamic_margin: Float[Array, " K"]
+    """By how much a measured candidate passes what keeps it from being called dynamic, in χ² units: RE₁ - Th₁, and of
+    the isolated the gate's verdict as well, whichever is less. Above 0 where dynamic, or, by a gate without verdicts,
+    left out; NaN where not measured."""
     p_dynamic: Float[Array, " K"]
     """Soft: to what degree a measured candidate is neither accepted nor recovered, in [0, 1]; with hard decisions 1
     where dynamic, else 0."""

@@ -101,6 +101,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         is_accepted=outcome.is_accepted,
         is_recovered=outcome.is_recovered,
         is_dynamic=outcome.is_dynamic,
+        dynamic_margin=outcome.dynamic_margin,
         p_dynamic=outcome.p_dynamic,
         inconsistent_id=jnp.where(is_flagged, state.track_id, FREE),
     )
@@ -169,6 +170,7 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
         is_accepted=nobody,
         is_recovered=nobody,
         is_dynamic=nobody,
+        dynamic_margin=nothing,
         p_dynamic=jnp.zeros(K, dtype),
         inconsistent_id=jnp.full(slot_count(config), FREE, jnp.int32),
     )

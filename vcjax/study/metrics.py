@@ -1,15 +1,16 @@
-"""One run against its truth: trajectory errors, consistency, and what was detected. Computed inside the batch."""
+"""One run against its truth: trajectory errors, consistency, events. Computed inside the batch."""
 
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from vcjax.ekf import mahalanobis
 from vcjax.filter.info import FrameInfo
 from vcjax.models.frames import quaternion_conjugate, quaternion_product, yaw_from_quaternion
 from vcjax.recording import Truth
+from vcjax.study.detection import detections
 
 
 def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
@@ -17,8 +18,6 @@ def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
 
     Errors are not aligned: estimate and truth start from the same known pose. Derivatives are exact where continuous.
     """
-    num_features = truth.is_moving.shape[0]
-    dynamic_id = jnp.where(info.is_dynamic, info.candidate_id, -1)
     return {
         **trajectory_errors(info, truth),
         "nis_sum": jnp.sum(jnp.where(info.is_accepted, info.re1, 0.0), axis=1),
@@ -29,10 +28,7 @@ def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
         "num_births": jnp.sum(info.born_id >= 0, axis=1),
         "num_landmarks": jnp.sum(info.track_id >= 0, axis=1),
         "num_coordinates": info.num_coordinates,
-        "dynamic_deletions": _count_by_feature(dynamic_id, num_features),
-        "inconsistent_deletions": _count_by_feature(info.inconsistent_id, num_features),
-        "frames_mapped": _count_by_feature(info.track_id, num_features),
-        "is_moving": jnp.asarray(truth.is_moving),
+        **detections(info, truth),
         "is_finite": jnp.all(info.is_finite),
         "map_full_frames": jnp.sum(info.map_is_full),
         "robot": info.vehicle[:, :7],
@@ -90,9 +86,3 @@ def _where_defined(square: Callable, error: Float[Array, "T n"], cov: Float[Arra
 def _wrap(angle: Float[Array, " T"]) -> Float[Array, " T"]:
     """An angle (rad) brought to [-π, π)."""
     return (angle + jnp.pi) % (2.0 * jnp.pi) - jnp.pi
-
-
-def _count_by_feature(ids: Int[Array, "T n"], num_features: int) -> Int[Array, " F"]:
-    """How often each feature is among the ids; -1 counts for none."""
-    places = jnp.where(ids >= 0, ids, num_features).ravel()
-    return jnp.zeros(num_features, jnp.int32).at[places].add(1, mode="drop")

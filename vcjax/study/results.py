@@ -8,7 +8,7 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from vcjax.simulation.simulate import simulate
 from vcjax.storage import replacing
 from vcjax.study.sweep import Experiment
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the layout of results, raised when an older reader would misread them."""
 
 PER_FRAME = {
@@ -46,9 +46,13 @@ PER_FEATURE = {
     "dynamic_deletions": "how often the gate called a feature dynamic",
     "inconsistent_deletions": "how often the detector deleted a feature",
     "frames_mapped": "frames a feature spent in the map",
+    "first_mapped": "first frame a feature was in the map; 0: never",
+    "first_deleted": "first frame it was deleted by gate or detector; 0: never",
+    "dynamic_margin": "how dynamic it ever looked to the gate, χ² units; NaN: never a measured candidate",
 }
 PER_RUN = {
     "is_finite": "whether all numbers of the run stayed finite",
+    "detection_auc": "share of pairs of a mover and another feature that dynamic_margin puts in the right order",
     "map_full_frames": "frames in which a feature had to wait for a free slot",
 }
 
@@ -105,10 +109,16 @@ def _truth(scenario: Scenario):
 
 def attributes(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Any]:
     """What results come from, as it is kept beside them: equal attributes, equal numbers."""
-    return {
-        "schema": SCHEMA,
+    return provenance(key) | {
         "scenario": json.dumps(describe(experiment.scenario)),
         "config": json.dumps(describe(experiment.config)),
+    }
+
+
+def provenance(key: PRNGKeyArray) -> dict[str, Any]:
+    """What all results come from: layout, random key, precision and version."""
+    return {
+        "schema": SCHEMA,
         "key": json.dumps(np.asarray(jax.random.key_data(key)).tolist()),
         "dtype": str(jax.dtypes.canonicalize_dtype(np.float64)),
         "vcjax": _version(),
@@ -152,22 +162,30 @@ def save(dataset: Any, path: str | os.PathLike) -> Path:
     return Path(path)
 
 
-def load(path: str | os.PathLike) -> Any:
+RUN_VARIABLES = (*PER_FRAME, *PER_FEATURE, *PER_RUN, "robot", "is_moving")
+"""What a file of runs holds at least."""
+
+
+def load(path: str | os.PathLike, variables: Collection[str] = RUN_VARIABLES) -> Any:
     """Read results back, whole.
+
+    Args:
+        path: the file.
+        variables: what it must hold.
 
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no results file of this schema.
     """
-    return _read(path, lambda dataset: dataset.load())
+    return _read(path, lambda dataset: dataset.load(), variables)
 
 
 def load_attributes(path: str | os.PathLike) -> dict[str, Any]:
     """Read what results come from (see `attributes`), and not the results themselves; otherwise as `load`."""
-    return _read(path, lambda dataset: dataset.attrs)
+    return _read(path, lambda dataset: dataset.attrs, RUN_VARIABLES)
 
 
-def _read(path: str | os.PathLike, part: Callable[[Any], Any]) -> Any:
+def _read(path: str | os.PathLike, part: Callable[[Any], Any], variables: Collection[str]) -> Any:
     xarray = import_xarray()
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such results file.")
@@ -178,7 +196,7 @@ def _read(path: str | os.PathLike, part: Callable[[Any], Any]) -> Any:
         raise ValueError(f"{path}: not a readable NetCDF-4 file ({error}); remove it and run again.") from error
     if found != SCHEMA:
         raise ValueError(f"{path}: schema {found}, but this version reads {SCHEMA}.")
-    if missing := sorted({*PER_FRAME, *PER_FEATURE, *PER_RUN, "robot", "is_moving"} - names):
+    if missing := sorted(set(variables) - names):
         raise ValueError(f"{path}: lacks {', '.join(missing)}; remove it and run again.")
     return result
 

@@ -22,17 +22,33 @@ FIGURES = {
     "inconsistent_deletions_per_run": "… by the detector",
     "dynamic_found_per_run": "movers found",
     "static_deleted_per_run": "static deleted",
+    "detection_f1": "detection F1",
+    "detection_auc": "detection AUC",
+    "detection_delay_frames": "detection delay, frames",
     "anees_position": "ANEES position (2 dof)",
     "anees_pose": "ANEES pose (3 dof)",
     "nis": "NIS / 2",
 }
 """Every per-run figure and its label, in the order of print."""
 
-DECIMALS = dict.fromkeys(FIGURES, 2) | {"orientation_error_deg": 4, "yaw_error_deg": 4}
+DECIMALS = dict.fromkeys(FIGURES, 2) | {
+    "orientation_error_deg": 4,
+    "yaw_error_deg": 4,
+    "detection_f1": 3,
+    "detection_auc": 3,
+}
 """Decimals shown of each figure: one more than a standard error over 25 runs warrants."""
 
-SOMETIMES_UNDEFINED = ("anees_position", "anees_pose", "nis")
-"""Figures that a run need not have (no covariance to speak of, no update): means are over the runs that have them."""
+SOMETIMES_UNDEFINED = (
+    "detection_f1",
+    "detection_auc",
+    "detection_delay_frames",
+    "anees_position",
+    "anees_pose",
+    "nis",
+)
+"""Figures that a run need not have (no mover, none found, no covariance to speak of, no update): means are over the
+runs that have them."""
 
 _DOF = {"anees_position": 2, "anees_pose": 3}
 _CONFIDENCE = 0.95
@@ -62,7 +78,12 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
 
     Errors are √(mean over frames of e²). A dynamic event is any deletion, by the gate's verdict or by the detector;
     `dynamic_found_per_run` and `static_deleted_per_run` count distinct moving and static features deleted at least
-    once. ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter; frames where it is not
+    once. With them, and with as many movers as were measured candidates or deleted, `detection_f1` is
+    2 found / (found + static deleted + movers); `detection_auc` is the area under the ROC of the features' largest
+    margin; both are NaN where there was no mover. `detection_delay_frames` is the mean over the movers found of the
+    frames from first birth to first deletion.
+
+    ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter; frames where it is not
     defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `nis` is the mean squared
     Mahalanobis distance of the accepted updates / 2, NaN where there was none; the gate cuts its tail off, so a
     consistent filter has 1 − t·exp(−t) / (1 − exp(−t)) with t = Th₁ / 2, which is 0.95 for Th₁ = 9.
@@ -75,6 +96,9 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
     """
     was_deleted = (runs.dynamic_deletions + runs.inconsistent_deletions) > 0
     num_updates = runs.num_updates.sum("frame")
+    is_found = was_deleted & runs.is_moving
+    found, called = is_found.sum("feature"), was_deleted.sum("feature")
+    num_movers = ((was_deleted | runs.dynamic_margin.notnull()) & runs.is_moving).sum("feature")
     verdicts, inconsistent = runs.num_dynamic.sum("frame"), runs.num_inconsistent.sum("frame")
     with np.errstate(over="ignore", invalid="ignore"):  # a failed run may hold anything; it is masked below
         figures = xr.Dataset(
@@ -86,8 +110,11 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
                 "dynamic_events_per_run": verdicts + inconsistent,
                 "dynamic_verdicts_per_run": verdicts,
                 "inconsistent_deletions_per_run": inconsistent,
-                "dynamic_found_per_run": (was_deleted & runs.is_moving).sum("feature"),
+                "dynamic_found_per_run": found,
                 "static_deleted_per_run": (was_deleted & ~runs.is_moving).sum("feature"),
+                "detection_f1": 2 * found / (called + num_movers).where(num_movers > 0),
+                "detection_auc": runs.detection_auc,
+                "detection_delay_frames": (runs.first_deleted - runs.first_mapped).where(is_found).mean("feature"),
                 "anees_position": runs.nees_position.mean("frame", skipna=True) / _DOF["anees_position"],
                 "anees_pose": runs.nees_pose.mean("frame", skipna=True) / _DOF["anees_pose"],
                 "nis": runs.nis_sum.sum("frame", skipna=False) / num_updates.where(num_updates > 0) / 2,

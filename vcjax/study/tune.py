@@ -1,228 +1,179 @@
-"""Tuning numbers of gate and camera by gradient: a smoothed objective, averaged over scenes and fresh seeds.
+"""Tuning numbers of gate and camera: descents by gradient from several starts, and a choice among their ends.
 
-Each parameter lives in an interval and is moved as a free number (see `intervals`). A step averages the objective and
-its gradient (forward mode: a few numbers, many seeds) over a mini-batch of seeds, new in every step, and over all
-scenes, and goes down it by Adam; the temperature of the smoothing falls from step to step. What a soft filter says of a
-setting is not what the hard filter does with it: look at the result with `monte_carlo`, on seeds that were not tuned
-on.
+Three kinds of seeds, none used twice: those of the descents, those by which the best of their ends is chosen, and those
+held out (see `choice`). With a directory every step and every block of runs is kept there, and tuning that was stopped
+goes on to the same numbers.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
-from jax.tree_util import Partial
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
+from scipy.stats import qmc
 
-from vcjax.fields import number, require, require_count, require_key, require_kind
+from vcjax.fields import require_key
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
+from vcjax.storage import write_file
+from vcjax.study.choice import Choice, Seeds, Setting, choose, setting_of
+from vcjax.study.descent import Schedule, Step, descend, end_of
 from vcjax.study.intervals import Interval
 from vcjax.study.losses import Objective
-from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
-from vcjax.study.sweep import Experiment, numeric_paths, replace_at
+from vcjax.study.problem import Problem, problem_of
+from vcjax.study.results import describe, import_xarray, provenance
 
-
-class Schedule(eqx.Module):
-    """How long and how fast to go."""
-
-    num_steps: int = eqx.field(static=True, default=40)
-    """Steps of the optimiser."""
-    seeds_per_step: int = eqx.field(static=True, default=16)
-    """Runs of each scene that a step averages."""
-    learning_rate: float = eqx.field(converter=number, default=0.1)
-    """Of Adam, in the free numbers: about how far x goes in a step. Positive."""
-    temperature_start: float = eqx.field(converter=number, default=4.0)
-    """τ of the smoothing in the first step, in χ² units; positive."""
-    temperature_end: float = eqx.field(converter=number, default=1.0)
-    """τ in the last; in between it changes by equal factors."""
-
-    def __check_init__(self):
-        for name in ("num_steps", "seeds_per_step"):
-            require_count(self, name, 1)
-        for name in ("learning_rate", "temperature_start", "temperature_end"):
-            require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
-
-    def temperature(self, step: int) -> float:
-        """τ of a step."""
-        part = step / max(self.num_steps - 1, 1)
-        return float(self.temperature_start * (self.temperature_end / self.temperature_start) ** part)
-
-
-class Step(NamedTuple):
-    """One step: where it was taken, and what was found there."""
-
-    parameters: dict[str, float]
-    temperature: float
-    loss: float
-    """Mean of the smoothed objective over the runs that stayed finite."""
-    loss_se: float
-    """Its standard error over runs."""
-    gradient: dict[str, float]
-    """By the free numbers."""
-    num_failed: int
-    """Runs left out because they, or their derivative, went non-finite."""
+_MARGIN = 0.1
+"""How near to the ends of their intervals starts are drawn, as a part of these."""
 
 
 class Tuned(NamedTuple):
     """What tuning gave."""
 
-    parameters: dict[str, float]
-    history: list[Step]
+    descents: list[list[Step]]
+    """Every step from every start; the first start is where the parameters were."""
+    choice: Choice
+    """Where they were, the best end of a descent, and what it is worth."""
+
+    num_runs: int
+    """Runs in the descents, each with its derivative."""
 
     @property
     def num_skipped(self) -> int:
         """Steps not taken because no run of theirs stayed finite."""
-        return sum(not np.isfinite(step.loss) for step in self.history)
+        return sum(not np.isfinite(step.loss) for steps in self.descents for step in steps)
+
+    @property
+    def num_failed(self) -> int:
+        """Runs left out of steps because they, or their derivative, went non-finite."""
+        return sum(step.num_failed for steps in self.descents for step in steps)
 
 
 def tune(
-    scenarios: Scenario | Sequence[Scenario],
+    scenarios: Mapping[str, Scenario],
     config: FilterConfig,
     parameters: Mapping[str, Interval],
     *,
     objective: Objective | None = None,
     schedule: Schedule | None = None,
+    num_starts: int = 1,
+    seeds: Seeds | None = None,
     key: PRNGKeyArray,
-    progress: Callable[[int, Step], None] | None = None,
+    directory: str | Path | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> Tuned:
-    """Tune numbers of scenario and configuration, the same for all scenes, from where they are.
-
-    Step k draws its seeds by `fold_in(key, k)`: equal arguments give equal results.
+    """Tune numbers of scenario and configuration, the same for all scenes.
 
     Args:
-        scenarios: one scene or several, which differ in numbers only (speeds, directions, places).
+        scenarios: scenes by name, which differ in numbers only and have the same start.
         config: the filter, with `smoothing` "soft" (a true gradient) or "straight_through" (the hard filter's numbers).
         parameters: path of a numeric leaf, as in a sweep → where it may go.
-        objective: what to make small; soft F1 of the tracks if None.
-        schedule: steps, seeds, temperatures.
+        objective: what to make small; F1 of the tracks if None.
+        schedule: steps, seeds and temperatures of each descent.
+        num_starts: descents; the first from where the parameters are, the others from points spread over the intervals
+            (a Halton sequence), since an objective may have several valleys.
+        seeds: to choose the best end of a descent, and to compare it with the start.
         key: base key.
-        progress: called with (steps done, step) after each.
-
-    Returns: the parameters after the last step, and every step.
+        directory: where the work is kept, and looked for.
+        progress: called with what was done last, and how much of how many steps or settings.
 
     Raises:
-        ValueError: for hard decisions, scenes that differ in structure, unknown paths, a start outside its interval, or
-            an objective that is not finite at the start; all but the last before anything compiles.
+        ValueError: for arguments that make no sense, before anything compiles; for an objective that is not finite at a
+            start; or if the directory holds other work.
+        OSError: if the directory cannot be written.
+        ModuleNotFoundError: if xarray is not installed.
     """
-    schedule, objective = schedule or Schedule(), objective or Objective()
-    scenarios = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
-    _check_arguments(scenarios, config, parameters, key)
-    first = Experiment(scenarios[0], config)
-    free = np.array([interval.to_free(_value_at(first, path)) for path, interval in parameters.items()])
-    scenes = jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios)
-    optimiser = optax.adam(float(schedule.learning_rate))
-    state, history = optimiser.init(jnp.asarray(free)), []
-    lanes = {"scene": np.repeat(np.arange(len(scenarios)), schedule.seeds_per_step)}
-    seeds = np.tile(np.arange(schedule.seeds_per_step), len(scenarios))
-    problem = Problem(scenes, config, objective, tuple(parameters), tuple(parameters.values()))
-    for k in range(schedule.num_steps):
-        temperature = schedule.temperature(k)
-        work = Partial(_value_and_gradient, problem, jnp.asarray(free), jnp.asarray(temperature))
-        runs = run_lanes(work, lanes, seeds, jax.random.fold_in(key, k))
-        step, gradient = _average(runs, _parameters(parameters, free), temperature)
-        if not history and not np.isfinite(step.loss):
-            raise ValueError(f"tune: the objective is not finite at the start, {step.parameters}; start elsewhere.")
-        if np.isfinite(step.loss):  # a step without a finite run is not taken
-            update, state = optimiser.update(jnp.asarray(gradient), state)
-            free = free + np.asarray(update)
-        history.append(step)
-        if progress is not None:
-            progress(k + 1, step)
-    return Tuned(_parameters(parameters, free), history)
-
-
-class Problem(eqx.Module):
-    """What is minimised: scenes (leading axis S), filter, objective, and which numbers are free."""
-
-    scenes: Scenario
-    config: FilterConfig
-    objective: Objective
-    paths: tuple[str, ...] = eqx.field(static=True)
-    intervals: tuple[Interval, ...]
-
-
-def _value_and_gradient(
-    problem: Problem, free: Float[Array, " P"], temperature: Float[Array, ""], lane: dict[str, Int[Array, ""]], key
-) -> dict[str, Array]:
-    """Objective of one run of one scene and its derivative by the free numbers, in forward mode."""
-    scenario = jax.tree.map(lambda leaves: jnp.asarray(leaves)[lane["scene"]], problem.scenes)
-
-    def loss(free):
-        intervals = zip(problem.paths, problem.intervals, free, strict=True)
-        values = {path: interval.to_parameter(x) for path, interval, x in intervals}
-        config = eqx.tree_at(lambda c: c.temperature, problem.config, temperature)
-        experiment = replace_at(Experiment(scenario, config), values)
-        value = problem.objective(experiment.scenario, *simulate_and_filter(experiment, key))
-        return value, value
-
-    gradient, value = jax.jacfwd(loss, has_aux=True)(free)
-    return {"loss": value, "gradient": gradient}
-
-
-def _average(runs: dict[str, np.ndarray], parameters: dict[str, float], temperature: float) -> tuple[Step, np.ndarray]:
-    """Mean over the runs that stayed finite."""
-    is_finite = np.isfinite(runs["loss"]) & np.all(np.isfinite(runs["gradient"]), axis=1)
-    num, num_failed = int(is_finite.sum()), int((~is_finite).sum())
-    loss, gradient = runs["loss"][is_finite], runs["gradient"][is_finite]
-    mean = gradient.mean(axis=0) if num else np.full(gradient.shape[1], np.nan)
-    step = Step(
-        parameters,
-        temperature,
-        float(loss.mean()) if num else np.nan,
-        float(loss.std(ddof=1) / np.sqrt(num)) if num > 1 else np.nan,
-        dict(zip(parameters, mean.tolist(), strict=True)),
-        num_failed,
-    )
-    return step, mean
-
-
-def _parameters(intervals: Mapping[str, Interval], free: np.ndarray) -> dict[str, float]:
-    """The parameters of some free numbers."""
-    return {path: float(i.to_parameter(jnp.asarray(x))) for (path, i), x in zip(intervals.items(), free, strict=True)}
-
-
-def _value_at(tree: Any, path: str) -> float:
-    """The number at a path."""
-    for name in path.split("."):
-        tree = tree[int(name)] if name.isdecimal() else getattr(tree, name)
-    return float(tree)
-
-
-def _check_arguments(scenarios: list, config: FilterConfig, parameters: Mapping[str, Interval], key) -> None:
-    """Refuse what cannot be tuned."""
+    import_xarray()
     require_key("tune", key)
-    require_kind("tune", "config", config, FilterConfig, "give a FilterConfig with smoothing='soft'.")
-    if config.smoothing == "hard" or config.reverse_mode:
-        raise ValueError(
-            f"tune(config.smoothing={config.smoothing!r}, config.reverse_mode={config.reverse_mode}): give "
-            "smoothing 'soft' or 'straight_through', which have a derivative, and reverse_mode=False."
-        )
-    if not scenarios:
-        raise ValueError("tune(scenarios=[]): give at least one scene.")
-    for scenario in scenarios:
-        require_kind("tune", "scenarios", scenario, Scenario, "give scenes, e.g. vcjax.scenarios.paper().")
-    structures = {(jax.tree.structure(s), tuple(np.shape(leaf) for leaf in jax.tree.leaves(s))) for s in scenarios}
-    if len(structures) > 1:
-        raise ValueError(
-            "tune(scenarios): the scenes differ in more than numbers; give all as many frames and features."
-        )
-    if not isinstance(parameters, Mapping) or not parameters:
-        raise ValueError(f"tune(parameters={parameters!r}): give at least one path with its interval.")
-    known = list(numeric_paths(Experiment(scenarios[0], config)))
-    for path, interval in parameters.items():
-        if path not in known:
-            raise ValueError(f"tune has no numeric leaf {path!r}; choose among: {', '.join(known)}.")
-        require_kind("tune", f"parameters[{path!r}]", interval, Interval, "give an Interval(low, high).")
-        values = {_value_at(Experiment(s, config), path) for s in scenarios}
-        if len(values) > 1:
-            raise ValueError(f"tune(scenarios): {path} is {sorted(values)} in them; give all scenes the same start.")
-        rate = min(float(s.frame_rate_hz) for s in scenarios)
-        if path == "scenario.oscillation.frequency_hz" and interval.high > rate / 2:
-            raise ValueError(
-                f"tune(parameters[{path!r}].high={interval.high:g}): f is below half the frame rate, {rate / 2:g} Hz."
+    schedule, directory = schedule or Schedule(), None if directory is None else Path(directory)
+    if not isinstance(num_starts, int | np.integer) or num_starts < 1:
+        raise ValueError(f"tune(num_starts={num_starts!r}): give a whole number of at least 1.")
+    problem = problem_of(scenarios, config, parameters, objective)
+    starts = _starts(problem, setting_of(scenarios, config, problem.paths), num_starts)
+    origin = _origin(scenarios, problem, schedule, key)
+    descent_key, choice_key = jax.random.split(key)
+    descents = []
+    for number, start in enumerate(starts):
+        kept = None if directory is None else KeptSteps(directory / "descents" / f"start_{number}.json", origin, start)
+
+        def told(history: list[Step], kept=kept, number=number):
+            if kept is not None:
+                kept.write(history)
+            if progress is not None:
+                progress(f"descent {number + 1} of {num_starts}", len(history), schedule.num_steps)
+
+        descents.append(
+            descend(
+                problem,
+                start,
+                schedule,
+                key=jax.random.fold_in(descent_key, number),
+                history=() if kept is None else kept.read(),
+                progress=told,
             )
+        )
+    choice = choose(
+        scenarios,
+        config,
+        [starts[0], *(end_of(problem, steps) for steps in descents)],
+        objective=problem.objective,
+        seeds=seeds or Seeds(),
+        key=choice_key,
+        directory=directory,
+        progress=progress,
+    )
+    runs_per_step = 2 * schedule.pairs_per_step * len(scenarios)
+    return Tuned(descents, choice, runs_per_step * sum(map(len, descents)))
+
+
+def _starts(problem: Problem, before: dict[str, float], num: int) -> list[dict[str, float]]:
+    """Where the descents begin."""
+    problem.to_free(before)
+    spread = qmc.Halton(len(problem.paths), scramble=False).random(num)[1:]  # its first point is a corner
+    part = _MARGIN + (1 - 2 * _MARGIN) * spread
+    return [before, *(problem.to_parameters(np.log(row / (1 - row))) for row in part)]
+
+
+def _origin(scenarios, problem: Problem, schedule: Schedule, key) -> dict[str, Any]:
+    """What the steps of a descent come from, as it is kept beside them."""
+    return provenance(key) | {
+        "scenarios": {name: describe(scenario) for name, scenario in scenarios.items()},
+        "config": describe(problem.config),
+        "objective": describe(problem.objective),
+        "parameters": {path: describe(i) for path, i in zip(problem.paths, problem.intervals, strict=True)},
+        "schedule": describe(schedule),
+    }
+
+
+class KeptSteps(NamedTuple):
+    """The file of a descent's steps."""
+
+    path: Path
+    origin: dict[str, Any]
+    start: Setting
+
+    def write(self, history: list[Step]) -> None:
+        """Write all steps, completely or not at all."""
+        content = {"origin": self.origin, "start": self.start, "steps": [step._asdict() for step in history]}
+        write_file(self.path, f"{json.dumps(content, indent=1)}\n".encode())
+
+    def read(self) -> list[Step]:
+        """The steps made already.
+
+        Raises:
+            ValueError: if they are of other work, or not readable.
+        """
+        if not self.path.is_file():
+            return []
+        try:
+            content = json.loads(self.path.read_text())
+            found, steps = content["origin"] | {"start": content["start"]}, [Step(**s) for s in content["steps"]]
+        except (ValueError, TypeError, KeyError) as error:
+            raise ValueError(f"{self.path}: no steps of a descent ({error}); remove it and run again.") from None
+        for name, value in json.loads(json.dumps(self.origin | {"start": self.start})).items():
+            if found.get(name) != value:
+                raise ValueError(f"{self.path} is of another {name}; give another directory, or remove this one.")
+        return steps

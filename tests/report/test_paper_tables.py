@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fake_runs import fake_results, fake_runs, with_failed_seed
 
-from vcjax.report.tables import REPORTED, tables, write_file, write_tables
+from vcjax.report.paper_tables import REPORTED, tables, write_file, write_tables
 from vcjax.study.paper import Cell, cells
 from vcjax.study.summary import paired_difference, summarise
 

@@ -4,22 +4,18 @@ Colours are those of Okabe and Ito, which people with colour-blindness can tell 
 all figures; lines differ in style as well. The files depend on the results alone: no date, no random identifiers.
 """
 
-import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 
-from vcjax.storage import write_file
+from vcjax.report.style import RC, new_figure, write_figure
 from vcjax.study.paper import RE, VC, VC_OSCILLATING, Cell, cells
 from vcjax.study.summary import mean_and_error, student_t
 
@@ -35,22 +31,6 @@ _STYLES = {
     VC_OSCILLATING: {"color": "#009e73", "linestyle": "-"},
 }
 _ROBOT, _MOVING, _STATIC = "#0072b2", "#d55e00", "#b3b3b3"
-_RC: Any = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib, so the figures look the same everywhere
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#4d4d4d",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.6,
-    "legend.frameon": False,
-    "svg.hashsalt": "vcjax",
-    "svg.fonttype": "path",
-}
 
 
 def write_figures(results: Mapping[Cell, xr.Dataset], directory: str | os.PathLike) -> list[Path]:
@@ -68,12 +48,11 @@ def write_figures(results: Mapping[Cell, xr.Dataset], directory: str | os.PathLi
     """
     folder = Path(directory) / "figures"
     paths = []
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context(RC):
         drawn = {number: error_figure(number, results) for number in _EXPERIMENTS} | {6: scene_figure(results)}
         for number, figure in drawn.items():
             if figure is not None:
-                folder.mkdir(exist_ok=True)
-                paths += [write_file(folder / f"figure_{number}.{kind}", _bytes(figure, kind)) for kind in _METADATA]
+                paths += write_figure(figure, folder / f"figure_{number}")
     return paths
 
 
@@ -93,7 +72,7 @@ def error_figure(number: int, results: Mapping[Cell, xr.Dataset]) -> Figure | No
     ]
     if not found:
         return None
-    figure = _new_figure(7.2, 3.4)
+    figure = new_figure(7.2, 3.4)
     position, orientation = figure.subplots(1, 2)
     for cell in found:
         runs = results[cell]
@@ -129,7 +108,7 @@ def scene_figure(results: Mapping[Cell, xr.Dataset]) -> Figure | None:
             panels[f"({letter}) dynamic: {case}, 1 m/s"] = scenes[0]
     if not panels:
         return None
-    figure = _new_figure(3.6 * len(panels), 6.0 - 0.8 * len(panels))
+    figure = new_figure(3.6 * len(panels), 6.0 - 0.8 * len(panels))
     for axes, (title, runs) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         _draw_scene(axes, runs)
         axes.set_title(title)
@@ -178,18 +157,3 @@ def _draw_arrows(axes: Axes, start: np.ndarray, end: np.ndarray, color: str) -> 
     arrow = {"arrowstyle": "-|>", "color": color, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0}
     for tail, head in zip(start, end, strict=True):
         axes.annotate("", head, tail, arrowprops=arrow, zorder=5)
-
-
-def _new_figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), layout=ConstrainedLayoutEngine(wspace=0.06, h_pad=0.08))
-    FigureCanvasAgg(figure)
-    return figure
-
-
-_METADATA = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
-
-
-def _bytes(figure: Figure, kind: str) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=200, metadata=_METADATA[kind])
-    return buffer.getvalue()

@@ -6,12 +6,13 @@ Both take the runs of any set of cells; what the missing cells would have shown 
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import xarray as xr
 
+from vcjax.report.markup import grid, with_nulls
 from vcjax.storage import write_file
 from vcjax.study.paper import SPEEDS_M_S, TABLES, Cell, Claim, cells, claims, pairs, paper_figures
 from vcjax.study.summary import DECIMALS, FIGURES, format_mean, paired_difference, runs_text, student_t, summarise
@@ -76,7 +77,7 @@ def write_tables(results: Mapping[Cell, xr.Dataset], directory: str | os.PathLik
         OSError: if the directory cannot be written to.
     """
     report = _report(results)
-    as_json = json.dumps(_with_nulls(_as_json(report)), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    as_json = json.dumps(with_nulls(_as_json(report)), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     contents = {"tables.json": as_json, "tables.md": _as_markdown(report)}
     return [write_file(Path(directory) / name, text.encode()) for name, text in contents.items()]
 
@@ -128,14 +129,6 @@ def _values(summary: xr.Dataset, name: str) -> list[float]:
     return [float(value) for value in summary[name].values]
 
 
-def _with_nulls(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _with_nulls(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_with_nulls(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _as_markdown(report: _Report) -> str:
     sections = [_INTRODUCTION.format(seeds=report.seeds, runs="run" if report.seeds == 1 else "runs")]
     for table in sorted({cell.table for cell in report.summaries}):
@@ -145,15 +138,15 @@ def _as_markdown(report: _Report) -> str:
         verdicts = [(claim, *_judge(claim, report)) for claim in claims(table) if _can_judge(claim, report)]
         sections += [
             f"## Table {table}: {title}\n",
-            _grid([motion, "Method", *heads, "ANEES position", "Runs"], _cell_rows(table, report)),
+            grid([motion, "Method", *heads, "ANEES position", "Runs"], _cell_rows(table, report)),
             _conclusion(table, verdicts),
         ]
         if differences := _difference_rows(table, report):
-            sections += ["Differences, paired by seed:\n", _grid([motion, "Difference", *heads], differences)]
+            sections += ["Differences, paired by seed:\n", grid([motion, "Difference", *heads], differences)]
         if verdicts:
             rows = [[claim.minuend.case, claim.text, interval, verdict] for claim, interval, verdict in verdicts]
             head = [motion, "The paper's statement", "Our figure or difference", "Verdict"]
-            sections += ["The paper's statements one by one:\n", _grid(head, rows)]
+            sections += ["The paper's statements one by one:\n", grid(head, rows)]
     return "\n".join(sections)
 
 
@@ -235,8 +228,3 @@ def _conclusion(table: int, verdicts: Sequence[tuple[Claim, str, str]]) -> str:
             where = "; ".join(f"{text} ({', '.join(cases)})" for text, cases in texts.items())
             lines.append(f"- {verdict.capitalize()}: {where}.")
     return "\n".join(lines) + "\n"
-
-
-def _grid(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"

@@ -12,8 +12,9 @@ from matplotlib.colors import to_hex
 from matplotlib.text import Annotation
 from scipy import stats
 
-from vcjax.report import figures
-from vcjax.report.figures import error_figure, scene_figure, write_figures
+from vcjax.report import paper_figures as figures
+from vcjax.report.paper_figures import error_figure, scene_figure, write_figures
+from vcjax.report.style import RC
 from vcjax.study.paper import Cell
 
 RE = Cell(2, "forward", None, None, "RE", False)
@@ -48,7 +49,7 @@ def test_the_same_results_give_the_same_bytes(results, tmp_path):
 def test_settings_of_matplotlib_are_left_alone(results, tmp_path):
     before = dict(matplotlib.rcParams)
     write_figures({RE: results[RE]}, tmp_path)
-    assert before["svg.hashsalt"] != figures._RC["svg.hashsalt"]
+    assert before["svg.hashsalt"] != RC["svg.hashsalt"]
     assert dict(matplotlib.rcParams) == before
     imports = ast.walk(ast.parse(inspect.getsource(figures)))
     assert not any("pyplot" in ast.dump(node) for node in imports if isinstance(node, (ast.Import, ast.ImportFrom)))
@@ -130,7 +131,7 @@ def test_scene_with_a_fast_mover_is_not_cut(results):
 
 @pytest.mark.parametrize("number", [3, 4, 5, 6, "6a"])
 def test_labels_are_whole_and_do_not_overlap(results, number):
-    with matplotlib.rc_context(figures._RC):
+    with matplotlib.rc_context(RC):
         if number == "6a":
             results = {cell: runs for cell, runs in results.items() if cell.dynamic_motion == "lateral"}
         figure = error_figure(number, results) if number in (3, 4, 5) else scene_figure(results)

@@ -1,0 +1,121 @@
+"""Does the gradient find what a grid finds, and with how many runs? Both search; both are judged on seeds held out.
+
+python scripts/gradient_against_grid.py thresholds --points 20 --out results/proof
+"""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Literal
+
+import jax
+import numpy as np
+import tyro
+
+import vcjax as vc
+from vcjax.commands.tune import WANTED
+from vcjax.report.tuning import write_search, write_tuning
+from vcjax.storage import write_file
+from vcjax.study.choice import Seeds
+from vcjax.study.descent import Schedule
+from vcjax.study.evaluate import evaluate
+from vcjax.study.intervals import OSCILLATION, THRESHOLDS
+from vcjax.study.landscape import as_grid, search
+from vcjax.study.scenes import Scenes
+from vcjax.study.summary import mean_and_error, student_t
+from vcjax.study.tune import tune
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """Search the same two numbers by a grid and by gradient, in all six dynamic scenes at once."""
+
+    what: tyro.conf.Positional[Literal["thresholds", "oscillation"]]
+    """Which numbers."""
+    points: int = 20
+    """Values along each axis of the grid."""
+    grid_seeds: int = 5
+    """Runs of each scene at every point of the grid."""
+    starts: int = 2
+    """Descents."""
+    steps: int = 12
+    """Steps of each."""
+    pairs: int = 3
+    """Pairs of runs of each scene in a step."""
+    choosing_seeds: int = 16
+    """Runs of each scene by which the best descent is chosen."""
+    held_out_seeds: int = 200
+    """Runs of each scene on which the two are compared."""
+    out: Path = Path("results/gradient_against_grid")
+    """Directory; work that was stopped goes on there."""
+
+
+def main(study: Study) -> None:
+    scenarios, directory = Scenes().make(), study.out / study.what
+    if study.what == "thresholds":
+        intervals = THRESHOLDS
+        axes = dict(
+            zip(intervals, (np.geomspace(2, 64, study.points), np.geomspace(0.5, 64, study.points)), strict=True)
+        )
+    else:
+        intervals = OSCILLATION
+        axes = {path: np.linspace(i.low, i.high, study.points + 1)[1:] for path, i in intervals.items()}
+    schedule = Schedule(num_steps=study.steps, pairs_per_step=study.pairs)
+    config = vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")
+    tuned = tune(
+        scenarios,
+        config,
+        intervals,
+        objective=WANTED,
+        schedule=schedule,
+        num_starts=study.starts,
+        seeds=Seeds(study.choosing_seeds, 100),
+        key=jax.random.key(1),
+        directory=directory / "gradient",
+        progress=lambda *done: print("gradient:", *done, flush=True),
+    )
+    found = search(
+        scenarios,
+        config,
+        axes,
+        objective=WANTED,
+        seeds=Seeds(study.grid_seeds, 100),
+        key=jax.random.key(2),
+        directory=directory / "grid",
+        progress=lambda *done: print("grid:", *done, flush=True),
+    )
+    write_tuning(tuned, {study.what: as_grid(found)}, directory / "gradient")
+    write_search(found, directory / "grid")
+
+    settings = {"before": found.before, "gradient": tuned.choice.after, "grid": found.after}
+    runs = evaluate(
+        scenarios,
+        config,
+        {path: [setting[path] for setting in settings.values()] for path in intervals},
+        objective=WANTED,
+        num_seeds=study.held_out_seeds,
+        key=jax.random.key(3),
+        directory=directory / "held_out",
+    )
+    loss = runs.loss.mean("scene")
+    difference = loss.sel(setting=1) - loss.sel(setting=2)
+    mean, error = mean_and_error(difference, difference.notnull())
+    half_width = float(error) * float(student_t(study.held_out_seeds))
+    grid_loss, num_gradient = float(loss.sel(setting=2).mean()), tuned.num_runs + tuned.choice.candidates.loss.size
+    report = {
+        "settings": settings,
+        "loss": {name: float(loss.sel(setting=i).mean()) for i, name in enumerate(settings)},
+        "gradient_minus_grid_percent": [
+            100 * value / grid_loss for value in (float(mean), float(mean) - half_width, float(mean) + half_width)
+        ],
+        "runs": {"gradient": num_gradient, "grid": found.candidates.loss.size},
+    }
+    print(json.dumps(report, indent=1))
+    write_file(directory / "report.json", f"{json.dumps(report, indent=1)}\n".encode())
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_num_cpu_devices", os.cpu_count())  # runs are shared between the cores
+    main(tyro.cli(Study))

@@ -1,0 +1,98 @@
+"""`vcjax sweep`: a grid over any two numbers, judged by hard decisions."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from vcjax.commands.console import numbered_key, progress_bar, say
+from vcjax.commands.tune import WANTED
+from vcjax.devices import Cores
+from vcjax.filter.config import FilterConfig
+from vcjax.gates.virtual_correction import VirtualCorrection
+from vcjax.report.comparison import comparison, comparison_markdown
+from vcjax.report.tuning import write_search
+from vcjax.study.choice import Seeds
+from vcjax.study.landscape import search
+from vcjax.study.losses import Objective
+from vcjax.study.scenes import Scenes
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """Run a grid over any two numbers of scenario and filter; draw what each point does; compare the best with before.
+
+    DIR holds every finished block of runs: a sweep that was stopped goes on there.
+    """
+
+    x: str = "config.gate.th1"
+    """First number, by its path, e.g. config.gate.th1, config.pixel_std_px, scenario.oscillation.amplitude_m."""
+    x_range: tuple[float, float] = (2.0, 64.0)
+    """From where to where."""
+    x_points: int = 12
+    """How many values."""
+    x_log: bool = True
+    """Equal factors between them instead of equal steps."""
+    y: str = "config.gate.th2"
+    """Second number."""
+    y_range: tuple[float, float] = (0.5, 64.0)
+    """From where to where."""
+    y_points: int = 12
+    """How many values."""
+    y_log: bool = True
+    """Equal factors between them instead of equal steps."""
+    scenes: Scenes = dataclasses.field(default_factory=Scenes)
+    """What every point is run in."""
+    objective: Objective = dataclasses.field(default_factory=lambda: WANTED)
+    """What the best point is the best by."""
+    th1: float = 9.0
+    """Th1 before."""
+    th2: float = 9.0
+    """Th2 before."""
+    seeds: int = 10
+    """Runs of each scene at every point."""
+    held_out_seeds: int = 100
+    """Runs of each scene on which the best point is compared with the setting before."""
+    key: int = 0
+    """Number of the base random key."""
+    out: Path = Path("results/sweep")
+    """Directory of the results."""
+    devices: Cores = dataclasses.field(default_factory=Cores)
+    """Where the runs are done."""
+
+    def __call__(self, console: Console) -> None:
+        """Run, draw, report."""
+        axes = {
+            self.x: _values("x", self.x_range, self.x_points, self.x_log),
+            self.y: _values("y", self.y_range, self.y_points, self.y_log),
+        }
+        scenarios, key = self.scenes.make(), numbered_key(self.key)
+        with progress_bar(console, "compiling, first block") as show:
+            choice = search(
+                scenarios,
+                FilterConfig(gate=VirtualCorrection(th1=self.th1, th2=self.th2)),
+                axes,
+                objective=self.objective,
+                seeds=Seeds(self.seeds, self.held_out_seeds),
+                key=key,
+                directory=self.out,
+                progress=lambda name, done, total: show(done, total, name),
+            )
+        print(comparison_markdown(comparison(choice)))
+        for path in write_search(choice, self.out):
+            say(console, f"wrote {path}")
+
+
+def _values(axis: str, ends: tuple[float, float], num: int, is_log: bool) -> np.ndarray:
+    """The values along an axis.
+
+    Raises:
+        ValueError: for ends or a number of points that give none.
+    """
+    low, high = ends
+    if not (np.isfinite(low) and np.isfinite(high) and low < high and (low > 0 or not is_log)):
+        raise ValueError(f"--{axis}-range {low:g} {high:g}: give two rising numbers, positive ones with --{axis}-log.")
+    if num < 2:
+        raise ValueError(f"--{axis}-points {num}: give at least two.")
+    return np.geomspace(low, high, num) if is_log else np.linspace(low, high, num)

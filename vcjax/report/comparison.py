@@ -1,0 +1,137 @@
+"""What a choice of settings is worth: every figure before and after, and the differences paired by seed."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from vcjax.report.markup import grid
+from vcjax.study import roc
+from vcjax.study.choice import COMPARED, FALSE_RATE, RECALL, Choice, by_scene, tracks_of
+from vcjax.study.summary import mean_and_error, student_t
+
+_DECIMALS = dict.fromkeys((*COMPARED, RECALL), 2) | {
+    "loss": 3,
+    "detection_f1": 3,
+    "detection_auc": 3,
+    RECALL: 3,
+    "orientation_error_deg": 3,
+}
+_LABELS = COMPARED | {RECALL: "recall at 1 % static"}
+_TABLES = (
+    ("detection_f1", RECALL, "position_rmse_cm"),
+    ("dynamic_found_per_run", "static_deleted_per_run", "detection_delay_frames"),
+    ("detection_auc", "orientation_error_deg", "anees_position"),
+    ("loss",),
+)
+_INTRODUCTION = """\
+Hard decisions, {seeds} seeds held out for each scene. Each cell: before → after, and in brackets the 95 % interval of
+the difference, paired by seed; bold where it excludes zero. *F1* = 2 found / (found + static deleted + movers) counts
+the features deleted at least once; *recall at 1 % static* is the share of the movers found if the largest margin of
+each feature is compared with the threshold at which 1 % of the static ones are called dynamic (tracks of all runs
+pooled, bootstrap over seeds); *delay* counts the frames from the birth of a mover to its deletion, where it was found.
+"""
+
+
+def comparison(choice: Choice) -> dict[str, Any]:
+    """A choice as plain values: `{"before": {...}, "after": {...}, "paired": {...}, "held_out_seeds": n}`.
+
+    `before` and `after` hold `parameters`, the `loss` (mean and se over all scenes) and by scene, the last of which is
+    all of them, `metrics`: each figure with `mean` and `se`. `paired` holds by scene and figure the `mean` of after -
+    before, its 95 % interval `lower` to `upper`, and `num_pairs`. Recall at 1 % static has its se and interval by
+    bootstrap; the others are Student-t.
+    """
+    runs = [choice.held_out.isel(setting=i, drop=True) for i in (0, 1)]
+    scenes, tracks = [by_scene(each) for each in runs], [tracks_of(each) for each in runs]
+    metrics: list[dict[str, Any]] = [{}, {}]
+    paired: dict[str, Any] = {}
+    for name in scenes[0]:
+        found = [_mean(scene[name]) for scene in scenes]
+        paired[name] = _difference(scenes[0][name], scenes[1][name])
+        recall = [_recall(track[name]) for track in tracks]
+        for figures, (value, samples) in zip(found, recall, strict=True):
+            figures[RECALL] = {"mean": value, "se": float(np.nanstd(samples))}
+        lower, upper = roc.interval(recall[1][1] - recall[0][1])
+        paired[name][RECALL] = {
+            "mean": recall[1][0] - recall[0][0],
+            "lower": float(lower),
+            "upper": float(upper),
+            "num_pairs": int(choice.held_out.sizes["seed"]),
+        }
+        for part, figures in zip(metrics, found, strict=True):
+            part[name] = figures
+    last = list(paired)[-1]
+    sides = {
+        side: {"parameters": dict(setting), "loss": part[last]["loss"], "metrics": part}
+        for side, setting, part in zip(("before", "after"), (choice.before, choice.after), metrics, strict=True)
+    }
+    return sides | {
+        "paired": paired,
+        "held_out_seeds": int(choice.held_out.sizes["seed"]),
+        "runs": {
+            "choosing": int(choice.candidates.loss.size),
+            "held_out": int(choice.held_out.loss.size),
+            "failed": int((~choice.candidates.is_finite).sum() + (~choice.held_out.is_finite).sum()),
+            "map_full": int((choice.held_out.map_full_frames > 0).sum()),
+        },
+    }
+
+
+def comparison_markdown(compared: Mapping[str, Any]) -> str:
+    """The same as Markdown."""
+    before, after = compared["before"], compared["after"]
+    rows = [
+        [f"`{path}`", f"{value:.4g}", f"{after['parameters'][path]:.4g}"]
+        for path, value in before["parameters"].items()
+    ]
+    sections = [grid(["parameter", "before", "after"], rows), _INTRODUCTION.format(seeds=compared["held_out_seeds"])]
+    for figures in _TABLES:
+        rows = [[scene, *(_cell(compared, scene, figure) for figure in figures)] for scene in compared["paired"]]
+        sections.append(grid(["scene", *(_LABELS[figure] for figure in figures)], rows))
+    return "\n".join(sections)
+
+
+def _cell(compared: Mapping[str, Any], scene: str, figure: str) -> str:
+    means = [compared[side]["metrics"][scene][figure]["mean"] for side in ("before", "after")]
+    difference = compared["paired"][scene][figure]
+    lower, upper, digits = difference["lower"], difference["upper"], _DECIMALS[figure]
+    text = " → ".join("–" if not _is_finite(mean) else f"{mean:.{digits}f}" for mean in means)
+    if not _is_finite(lower):
+        return text
+    text = f"{text} [{lower:+.{digits}f}, {upper:+.{digits}f}]".replace("-", "−")
+    return f"**{text}**" if lower > 0 or upper < 0 else text
+
+
+def _mean(figures: xr.Dataset) -> dict[str, Any]:
+    """Mean and standard error of each figure over the seeds that have it."""
+    found = {}
+    for name in COMPARED:
+        mean, error = mean_and_error(figures[name], figures[name].notnull())
+        found[name] = {"mean": float(mean), "se": float(error)}
+    return found
+
+
+def _difference(before: xr.Dataset, after: xr.Dataset) -> dict[str, Any]:
+    """Mean of after - before with its interval, of each figure over the seeds that have it in both."""
+    found = {}
+    for name in COMPARED:
+        difference = after[name] - before[name]
+        counts = difference.notnull()
+        mean, error = mean_and_error(difference, counts)
+        num = int(counts.sum())
+        half_width = float(error) * float(student_t(num))
+        mean = float(mean)
+        found[name] = {"mean": mean, "lower": mean - half_width, "upper": mean + half_width, "num_pairs": num}
+    return found
+
+
+def _recall(tracks: roc.Tracks) -> tuple[float, np.ndarray]:
+    """Recall at `FALSE_RATE`, and the same of every resample of the seeds."""
+    rate = np.array([FALSE_RATE])
+    return float(roc.recall_at(tracks, rate)[0, 0]), roc.resampled(roc.recall_at, tracks, rate)[:, 0]
+
+
+def _is_finite(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)

@@ -1,0 +1,82 @@
+"""ROC and precision–recall curves over tracks, before and after a choice of settings."""
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vcjax.report.style import RC, new_figure
+from vcjax.study import roc
+from vcjax.study.choice import ALL, FALSE_RATE, Choice, tracks_of
+
+STYLES = {
+    "before": {"color": "#4d4d4d", "linestyle": (0, (5, 2))},
+    "after": {"color": "#009e73", "linestyle": "-"},
+}
+"""How the two settings are drawn in all figures."""
+_LOWEST = 1e-3
+
+
+@matplotlib.rc_context(RC)
+def curves_figure(choice: Choice) -> Figure:
+    """Both curves over the tracks of all scenes and held-out seeds, with pointwise 95 % bands by bootstrap."""
+    figure = new_figure(7.2, 3.6)
+    left, right = figure.subplots(1, 2)
+    for tracks, (side, style) in zip(_tracks(choice), STYLES.items(), strict=True):
+        _draw(left, roc.FALSE_RATES, roc.recall_at, tracks[ALL], side, style)
+        _draw(right, roc.RECALLS, roc.precision_at, tracks[ALL], side, style)
+    _roc_axes(left)
+    right.set_xlabel("recall: share of the movers found")
+    right.set_ylabel("precision: movers among those called dynamic")
+    right.set_xlim(0, 1)
+    right.set_ylim(0, 1.02)
+    seeds, scenes = choice.held_out.sizes["seed"], choice.held_out.sizes["scene"]
+    _finish(figure, left, f"Tracks of {scenes} scenes × {seeds} held-out runs, 95 % bands")
+    return figure
+
+
+@matplotlib.rc_context(RC)
+def roc_by_scene_figure(choice: Choice) -> Figure:
+    """The ROC of each scene by itself."""
+    before, after = _tracks(choice)
+    names = [name for name in before if name != ALL]
+    columns = min(3, len(names))
+    rows = -(-len(names) // columns)
+    figure = new_figure(2.4 * columns + 0.4, 2.3 * rows + 0.5)
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for axes in panels.flat[len(names) :]:
+        axes.remove()
+    for axes, name in zip(panels.flat, names, strict=False):
+        for tracks, (side, style) in zip((before, after), STYLES.items(), strict=True):
+            _draw(axes, roc.FALSE_RATES, roc.recall_at, tracks[name], side, style)
+        _roc_axes(axes)
+        axes.set_title(name)
+        axes.label_outer()
+    _finish(figure, panels[0, 0], f"ROC over the tracks of {choice.held_out.sizes['seed']} held-out runs, 95 % bands")
+    return figure
+
+
+def _tracks(choice: Choice) -> list[dict[str, roc.Tracks]]:
+    return [tracks_of(choice.held_out.isel(setting=i)) for i in (0, 1)]
+
+
+def _draw(axes: Axes, levels: np.ndarray, curve, tracks: roc.Tracks, side: str, style: dict) -> None:
+    low, high = roc.interval(roc.resampled(curve, tracks, levels))
+    x = np.maximum(levels, _LOWEST) if curve is roc.recall_at else levels
+    axes.plot(x, curve(tracks, levels)[0], label=side, **style)
+    axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+
+
+def _roc_axes(axes: Axes) -> None:
+    axes.axvline(FALSE_RATE, color="#b3b3b3", linewidth=0.8, linestyle=":")
+    axes.set_xscale("log")
+    axes.set_xlim(_LOWEST, 1)
+    axes.set_ylim(0, 1.02)
+    axes.set_xlabel("static tracks called dynamic")
+    axes.set_ylabel("movers found")
+
+
+def _finish(figure: Figure, axes: Axes, title: str) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, handlelength=2.8)
+    figure.suptitle(title, fontsize=10)

@@ -1,0 +1,84 @@
+"""Heat maps over two numbers: what every point of a grid does to detection and position."""
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, ScalarFormatter
+
+from vcjax.report.style import RC, new_figure
+
+PANELS = {
+    "detection_f1": ("F1", "viridis"),
+    "detection_auc": ("AUC", "viridis"),
+    "position_rmse_cm": ("position error, cm", "viridis_r"),
+    "loss": ("objective", "viridis_r"),
+}
+"""Figures shown, their titles, and colours of which the brighter is the better."""
+_LABELS = {
+    "config.gate.th1": "Th₁",
+    "config.gate.th2": "Th₂",
+    "scenario.oscillation.amplitude_m": "A, m",
+    "scenario.oscillation.frequency_hz": "f, Hz",
+}
+
+
+@matplotlib.rc_context(RC)
+def landscape_figure(
+    grid: xr.Dataset,
+    title: str,
+    marks: Mapping[str, Mapping[str, float]] | None = None,
+    paths: Sequence[Sequence[Mapping[str, float]]] = (),
+) -> Figure:
+    """F1, AUC, position error and objective over a grid, means over its scenes and seeds.
+
+    Args:
+        grid: runs (x, y, scene, seed), as from `landscape.as_grid`.
+        title: what is shown.
+        marks: settings to mark, by name.
+        paths: settings one after another, drawn as lines: the paths of descents.
+    """
+    x, y = (str(dim) for dim in list(grid.dims)[:2])
+    figure = new_figure(8.6, 6.6)
+    panels = figure.subplots(2, 2, sharex=True, sharey=True)
+    for axes, (name, (label, colours)) in zip(panels.flat, PANELS.items(), strict=True):
+        values = grid[name].mean(("scene", "seed")).transpose(y, x)
+        image = axes.pcolormesh(grid[x], grid[y], values, cmap=colours, shading="nearest", rasterized=True)
+        figure.colorbar(image, ax=axes)
+        axes.grid(False)
+        axes.set_title(label)
+        axes.set_xlabel(_LABELS.get(x, x))
+        axes.set_ylabel(_LABELS.get(y, y))
+        _scale(axes, grid[x].values, grid[y].values)
+        for path in paths:
+            axes.plot(
+                [p[x] for p in path], [p[y] for p in path], color="white", linewidth=1.2, marker=".", markersize=3
+            )
+        for (mark, setting), symbol in zip((marks or {}).items(), "os^D", strict=False):
+            axes.plot(
+                setting[x], setting[y], symbol, color="#d55e00", markeredgecolor="white", markersize=8, label=mark
+            )
+        axes.label_outer()
+    if marks:
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(marks))
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def _scale(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
+    """A logarithmic scale where the values are spread so."""
+    for values, set_scale, axis, limit in (
+        (x, axes.set_xscale, axes.xaxis, axes.set_xlim),
+        (y, axes.set_yscale, axes.yaxis, axes.set_ylim),
+    ):
+        if len(values) > 2 and values[0] > 0 and np.ptp(np.diff(np.log(values))) < 1e-6:
+            set_scale("log")
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter(ScalarFormatter())
+            axis.set_minor_locator(LogLocator(subs=()))
+            half = np.sqrt(values[1] / values[0])
+            limit(values[0] / half, values[-1] * half)

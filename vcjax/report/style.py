@@ -1,0 +1,54 @@
+"""How all figures look, and their files, which depend on the results alone: no date, no random identifiers."""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from vcjax.storage import write_file
+
+RC: Any = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib, so the figures look the same everywhere
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#4d4d4d",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.6,
+    "legend.frameon": False,
+    "svg.hashsalt": "vcjax",
+    "svg.fonttype": "path",
+}
+"""Matplotlib's settings."""
+_METADATA = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure whose panels make room for each other."""
+    figure = Figure(figsize=(width_in, height_in), layout=ConstrainedLayoutEngine(wspace=0.06, h_pad=0.08))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def write_figure(figure: Figure, path: Path) -> list[Path]:
+    """Write a figure as `path` with the endings .png and .svg; folders are made as needed.
+
+    Raises:
+        OSError: if the place cannot be written to.
+    """
+    return [write_file(path.with_name(f"{path.name}.{kind}"), _bytes(figure, kind)) for kind in _METADATA]
+
+
+def _bytes(figure: Figure, kind: str) -> bytes:
+    buffer = io.BytesIO()
+    with matplotlib.rc_context(RC):
+        figure.savefig(buffer, format=kind, dpi=200, metadata=_METADATA[kind])
+    return buffer.getvalue()

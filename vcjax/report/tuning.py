@@ -1,0 +1,112 @@
+"""What a search for settings gave, as files: JSON for programs, Markdown for people, figures."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from vcjax.report.comparison import comparison, comparison_markdown
+from vcjax.report.descent import descent_figure
+from vcjax.report.detection_curves import curves_figure, roc_by_scene_figure
+from vcjax.report.landscape import landscape_figure
+from vcjax.report.markup import with_nulls
+from vcjax.report.style import write_figure
+from vcjax.storage import write_file
+from vcjax.study.choice import Choice
+from vcjax.study.landscape import as_grid
+from vcjax.study.results import save
+from vcjax.study.tune import Tuned
+
+
+def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: Path) -> list[Path]:
+    """Write `tune.json`, `tune.md` and the figures of a tuning into a directory.
+
+    `tune.json` is a `comparison` with the `history` of every descent, each step with its parameters, temperature,
+    smoothed loss and gradient; and how many runs there were, and steps and pairs of runs that were left out.
+
+    Args:
+        tuned: the tuning.
+        landscapes: grids over two of the numbers, by name, on which the paths are drawn.
+        directory: where to write.
+
+    Returns: the paths written.
+
+    Raises:
+        OSError: if the directory cannot be written to.
+    """
+    compared = comparison(tuned.choice)
+    compared["runs"]["descents"] = tuned.num_runs
+    compared |= {
+        "history": [[step._asdict() for step in steps] for steps in tuned.descents],
+        "steps_skipped": tuned.num_skipped,
+        "pairs_failed": tuned.num_failed,
+    }
+    title = "# Tuned by gradient\n\n" + _runs(compared) + "\n"
+    paths = _write(compared, title, directory / "tune")
+    folder = directory / "figures"
+    paths += write_figure(descent_figure(tuned.descents), folder / "descent")
+    marks = {"before": tuned.choice.before, "after": tuned.choice.after}
+    for name, grid in landscapes.items():
+        others = {path: value for path, value in tuned.choice.after.items() if path not in grid.dims}
+        title = f"Hard decisions, {_means(grid)}" + (", the other numbers as tuned" if others else "")
+        ways = [[step.parameters for step in steps] for steps in tuned.descents]
+        paths += write_figure(landscape_figure(grid, title, marks, ways), folder / f"landscape_{name}")
+    return [*paths, *_write_curves(tuned.choice, folder)]
+
+
+def write_search(choice: Choice, directory: Path) -> list[Path]:
+    """Write `sweep.nc` (all runs of the grid), `sweep.json`, `sweep.md` and the figures of a search into a directory.
+
+    `sweep.json` is a `comparison`, `after` being the best point of the grid, with the means over all scenes and seeds
+    of every point: `grid`.
+
+    Returns: the paths written.
+
+    Raises:
+        OSError: if the directory cannot be written to.
+    """
+    compared, grid = comparison(choice), as_grid(choice)
+    means = grid[["loss", "detection_f1", "detection_auc", "detection_delay_frames", "position_rmse_cm"]].mean(
+        ("scene", "seed")
+    )
+    compared["grid"] = {str(name): values.values.tolist() for name, values in {**means.coords, **means}.items()}
+    compared["grid_dimensions"] = [str(dim) for dim in means.loss.dims]
+    paths = [save(grid, directory / "sweep.nc")]
+    title = f"# Best point of a grid of {means.loss.size}\n\n" + _runs(compared) + "\n"
+    paths += _write(compared, title, directory / "sweep")
+    folder, marks = directory / "figures", {"before": choice.before, "best point": choice.after}
+    paths += write_figure(landscape_figure(grid, f"Hard decisions, {_means(grid)}", marks), folder / "landscape")
+    for number, name in enumerate(grid.scene.values, start=1):
+        one = grid.sel(scene=[name])
+        figure = landscape_figure(one, f"Hard decisions, {name}, {_means(one)}", marks)
+        paths += write_figure(figure, folder / f"landscape_scene_{number}")
+    return [*paths, *_write_curves(choice, folder)]
+
+
+def _write(compared: dict[str, Any], title: str, path: Path) -> list[Path]:
+    content = json.dumps(with_nulls(compared), indent=1)
+    return [
+        write_file(path.with_suffix(".json"), f"{content}\n".encode()),
+        write_file(path.with_suffix(".md"), (title + "\n" + comparison_markdown(compared)).encode()),
+    ]
+
+
+def _write_curves(choice: Choice, folder: Path) -> list[Path]:
+    return [
+        *write_figure(curves_figure(choice), folder / "curves"),
+        *write_figure(roc_by_scene_figure(choice), folder / "roc_by_scene"),
+    ]
+
+
+def _means(grid: xr.Dataset) -> str:
+    scenes, seeds = grid.sizes["scene"], grid.sizes["seed"]
+    return f"means over {f'{scenes} scenes × ' if scenes > 1 else ''}{seeds} runs at every point"
+
+
+def _runs(compared: Mapping[str, Any]) -> str:
+    runs = compared["runs"]
+    parts = [f"{runs['descents']} runs with their derivative in the descents"] if "descents" in runs else []
+    parts += [f"{runs['choosing']} runs to choose", f"{runs['held_out']} held out; {runs['failed']} went non-finite"]
+    return ", ".join(parts) + "."

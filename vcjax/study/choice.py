@@ -1,0 +1,165 @@
+"""Choosing among settings, and what the choice is worth: judged by hard decisions on seeds held out, in pairs.
+
+However candidates were found, by gradient or on a grid, the best of them looks better than it is on the seeds that
+chose it. So it is compared with the setting that was there before on seeds that nothing else has seen.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from vcjax.filter.config import FilterConfig
+from vcjax.simulation.scenarios import Scenario
+from vcjax.study import roc
+from vcjax.study.evaluate import evaluate
+from vcjax.study.losses import Objective
+from vcjax.study.sweep import Experiment
+
+Setting = dict[str, float]
+"""Path of a numeric leaf → its value."""
+FALSE_RATE = 0.01
+"""Share of the static tracks called dynamic at which the share of the movers found is reported."""
+COMPARED = {
+    "loss": "objective",
+    "detection_f1": "F1",
+    "detection_auc": "AUC",
+    "dynamic_found_per_run": "movers found",
+    "static_deleted_per_run": "static deleted",
+    "detection_delay_frames": "delay, frames",
+    "position_rmse_cm": "position, cm",
+    "orientation_error_deg": "orientation, deg",
+    "anees_position": "ANEES position",
+}
+"""Figures in which settings are compared, and their labels."""
+RECALL = "recall_at_1_percent_static"
+"""Share of the movers found at `FALSE_RATE`."""
+ALL = "all scenes"
+
+
+class Choice(NamedTuple):
+    """A setting chosen among candidates."""
+
+    before: Setting
+    """What scenes and configuration had."""
+    after: Setting
+    """The candidate of least mean loss; `before`, which is one of them, where nothing is better."""
+    candidates: Any
+    """Runs (setting, scene, seed) of all candidates, the first being `before`; see `evaluate`."""
+    held_out: Any
+    """Runs of `before` (setting 0) and `after` (setting 1) on other seeds."""
+
+
+class Seeds(NamedTuple):
+    """How many runs of each scene there are, for each setting."""
+
+    choosing: int = 16
+    """To choose among the candidates."""
+    held_out: int = 100
+    """To compare the choice with what was there before."""
+
+
+def choose(
+    scenarios: Mapping[str, Scenario],
+    config: FilterConfig,
+    candidates: Sequence[Setting],
+    *,
+    objective: Objective,
+    seeds: Seeds,
+    key: PRNGKeyArray,
+    directory: Path | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Choice:
+    """Run all candidates, take the best, and run it and the first of them on seeds held out.
+
+    Args:
+        scenarios: scenes by name.
+        config: the filter; it decides hard.
+        candidates: settings of the same paths, the first of them the one to compare with.
+        objective: what is to be small.
+        seeds: how many.
+        key: base key. The seeds held out depend on it alone, and not on the candidates.
+        directory: where finished blocks are kept, in `candidates` and `held_out`.
+        progress: called with what is done, and how many settings of how many.
+
+    Raises:
+        ValueError: as `evaluate`; for an empty set of seeds, or if no candidate has a finite run.
+    """
+    for name, number in seeds._asdict().items():
+        if not isinstance(number, int | np.integer) or number < 1:
+            raise ValueError(f"Seeds({name}={number!r}): give a whole number of at least 1.")
+    choosing_key, held_out_key = jax.random.split(key)
+
+    def judge(name: str, settings: Sequence[Setting], num_seeds: int, key) -> Any:
+        def told(done: int, total: int) -> None:
+            if progress is not None:
+                progress(name, done, total)
+
+        return evaluate(
+            scenarios,
+            config,
+            {path: [setting[path] for setting in settings] for path in settings[0]},
+            objective=objective,
+            num_seeds=num_seeds,
+            key=key,
+            directory=None if directory is None else directory / name.replace(" ", "_"),
+            progress=told,
+        )
+
+    runs = judge("candidates", candidates, seeds.choosing, choosing_key)
+    loss = runs.loss.mean(("scene", "seed")).values
+    if np.all(np.isnan(loss)):
+        raise ValueError("no run of any candidate stayed finite; start elsewhere.")
+    after = candidates[int(np.nanargmin(loss))]
+    return Choice(candidates[0], after, runs, judge("held out", [candidates[0], after], seeds.held_out, held_out_key))
+
+
+def setting_of(scenarios: Mapping[str, Scenario], config: FilterConfig, paths: Sequence[str]) -> Setting:
+    """The numbers at some paths, as scenes and configuration have them.
+
+    Raises:
+        ValueError: for a number that differs between the scenes.
+    """
+    setting = {}
+    for path in paths:
+        values = {_value_at(Experiment(scenario, config), path) for scenario in scenarios.values()}
+        if len(values) > 1:
+            raise ValueError(f"{path} is {sorted(values)} in the scenes; give all the same.")
+        setting[path] = values.pop()
+    return setting
+
+
+def by_scene(runs: Any) -> dict[str, Any]:
+    """Runs of one setting for each scene, and over all scenes: there a run's figure is the mean of its scenes'."""
+    names = [str(name) for name in runs.scene.values]
+    scenes = {name: runs.sel(scene=name)[list(COMPARED)] for name in names}
+    return scenes | {ALL: runs[list(COMPARED)].mean("scene")}
+
+
+def tracks_of(runs: Any) -> dict[str, roc.Tracks]:
+    """The tracks of one setting's runs for each scene, and of all scenes together."""
+
+    def tracks(runs) -> roc.Tracks:
+        score = runs.dynamic_margin.transpose("seed", ..., "feature")
+        is_mover = runs.is_moving.broadcast_like(score).transpose(*score.dims)
+        num_seeds = score.sizes["seed"]
+        return roc.Tracks(score.values.reshape(num_seeds, -1), is_mover.values.reshape(num_seeds, -1))
+
+    return {str(name): tracks(runs.sel(scene=name)) for name in runs.scene.values} | {ALL: tracks(runs)}
+
+
+def _value_at(tree: Any, path: str) -> float:
+    """The number at a path.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    try:
+        for name in path.split("."):
+            tree = tree[int(name)] if name.isdecimal() else getattr(tree, name)
+        return float(tree)
+    except (AttributeError, IndexError, TypeError):
+        raise ValueError(f"there is no number at {path!r}.") from None

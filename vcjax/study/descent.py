@@ -1,0 +1,207 @@
+"""Going down a smoothed objective by gradient, averaged over scenes and fresh seeds.
+
+Each parameter lives in an interval and is moved as a free number x (see `intervals`). A step averages the objective and
+its gradient over a mini-batch of seeds, new in every step, and over all scenes, and goes down it by Adam; the
+temperature of the smoothing falls from step to step.
+
+The derivative of one long run need not say where the mean of many goes: a run's phase of oscillation depends on f times
+its whole length, and its loss ripples with f over less than a tenth of a hertz, steeply. So what is made small is the
+mean over a neighbourhood, E[L(x + ε)] with ε ~ N(0, σ² I), whose gradient has two unbiased estimates:
+
+    pathwise        ∂L/∂x at x ± ε, in forward mode           sharp where runs change smoothly, as with Th₁, Th₂ and A
+    of the pair     (L(x + ε) - L(x - ε)) ε / 2σ²             sharp where they ripple, as with f
+
+Both come from the same pair of runs of one seed. Each parameter takes their mean weighted by the inverse of their
+variances over the mini-batch. What a soft filter says of a setting is not what the hard filter does with it: `choice`
+looks at that.
+
+References:
+    Parmas, Rasmussen, Peters, Doya 2018, "PIPPS: Flexible model-based policy search robust to the curse of chaos".
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.tree_util import Partial
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from vcjax.fields import number, require, require_count, require_key
+from vcjax.study.evaluate import scene
+from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
+from vcjax.study.problem import Problem
+from vcjax.study.sweep import Experiment, replace_at
+
+
+class Schedule(eqx.Module):
+    """How long and how fast to go."""
+
+    num_steps: int = eqx.field(static=True, default=20)
+    """Steps of the optimiser."""
+    pairs_per_step: int = eqx.field(static=True, default=4)
+    """Seeds of each scene that a step averages; each gives a pair of runs."""
+    spread: float = eqx.field(converter=number, default=0.2)
+    """σ of the neighbourhood over which the objective is averaged, in the free numbers; positive."""
+    learning_rate: float = eqx.field(converter=number, default=0.3)
+    """Of Adam, in the free numbers: about how far x goes in the first step; it falls to a tenth by a cosine.
+    Positive."""
+    temperature_start: float = eqx.field(converter=number, default=2.0)
+    """τ of the smoothing in the first step, in χ² units; positive."""
+    temperature_end: float = eqx.field(converter=number, default=0.5)
+    """τ in the last; in between it changes by equal factors."""
+
+    def __check_init__(self):
+        for name in ("num_steps", "pairs_per_step"):
+            require_count(self, name, 1)
+        for name in ("spread", "learning_rate", "temperature_start", "temperature_end"):
+            require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
+
+    def temperature(self, step: int) -> float:
+        """τ of a step."""
+        part = step / max(self.num_steps - 1, 1)
+        return float(self.temperature_start * (self.temperature_end / self.temperature_start) ** part)
+
+    def learning_rates(self) -> optax.Schedule:
+        """The learning rate by the number of steps taken."""
+        return optax.cosine_decay_schedule(float(self.learning_rate), self.num_steps, alpha=0.1)
+
+
+class Step(NamedTuple):
+    """One step: where it was taken, and what was found there."""
+
+    parameters: dict[str, float]
+    temperature: float
+    loss: float
+    """Mean of the smoothed objective over the runs that stayed finite."""
+    loss_se: float
+    """Its standard error over runs."""
+    gradient: dict[str, float]
+    """By the free numbers."""
+    pathwise: dict[str, float]
+    """Weight of the pathwise estimate in it, 0 to 1; the rest is that of the pairs."""
+    num_failed: int
+    """Pairs left out because a run of theirs, or its derivative, went non-finite."""
+
+
+def descend(
+    problem: Problem,
+    start: Mapping[str, float],
+    schedule: Schedule,
+    *,
+    key: PRNGKeyArray,
+    history: Sequence[Step] = (),
+    progress: Callable[[list[Step]], None] | None = None,
+) -> list[Step]:
+    """Go down from a start; step k draws its seeds by `fold_in(key, k)`.
+
+    Args:
+        problem: what is minimised.
+        start: the parameters to begin with, inside their intervals.
+        schedule: steps, seeds, temperatures.
+        key: base key.
+        history: steps that were made already, with equal arguments; they are not made again.
+        progress: called with all steps made so far, after each.
+
+    Returns: every step. Equal arguments give equal steps, wherever the work was stopped in between.
+
+    Raises:
+        ValueError: if the objective is not finite at the start.
+    """
+    require_key("descend", key)
+    history, optimiser = list(history), optax.adam(schedule.learning_rates())
+    free = problem.to_free(start)
+    state = optimiser.init(jnp.asarray(free))
+    for step in history:
+        free, state = _move(optimiser, free, state, step)
+    num_scenes = len(jax.tree.leaves(problem.scenes)[0])
+    # Lanes: scenes × seeds × the two of a pair. Every pair has a seed of its own.
+    number, pair, other = (axis.ravel() for axis in np.indices((num_scenes, schedule.pairs_per_step, 2)))
+    seeds, lanes = number * schedule.pairs_per_step + pair, {"scene": number, "sign": 1.0 - 2.0 * other}
+    spread = jnp.asarray(schedule.spread)
+    for k in range(len(history), schedule.num_steps):
+        temperature = schedule.temperature(k)
+        work = Partial(_value_and_gradient, problem, jnp.asarray(free), spread, jnp.asarray(temperature))
+        runs = run_lanes(work, lanes, seeds, jax.random.fold_in(key, k))
+        step = _average(runs, problem.to_parameters(free), temperature, float(schedule.spread))
+        if not history and not np.isfinite(step.loss):
+            raise ValueError(f"the objective is not finite at the start, {step.parameters}; start elsewhere.")
+        history.append(step)
+        free, state = _move(optimiser, free, state, step)
+        if progress is not None:
+            progress(list(history))
+    return history
+
+
+def end_of(problem: Problem, history: Sequence[Step]) -> dict[str, float]:
+    """Where a descent has led: the mean of the free numbers over its last quarter, which averages the noise out.
+
+    References:
+        Polyak, Juditsky 1992, "Acceleration of stochastic approximation by averaging".
+    """
+    last = history[-max(1, len(history) // 4) :]
+    return problem.to_parameters(np.mean([problem.to_free(step.parameters) for step in last], axis=0))
+
+
+def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any, step: Step) -> tuple[np.ndarray, Any]:
+    """One step of the optimiser; none where no run was finite."""
+    if not np.isfinite(step.loss):
+        return free, state
+    update, state = optimiser.update(jnp.asarray(list(step.gradient.values())), state)
+    return free + np.asarray(update), state
+
+
+def _value_and_gradient(
+    problem: Problem,
+    free: Float[Array, " P"],
+    spread: Float[Array, ""],
+    temperature: Float[Array, ""],
+    lane: dict[str, Array],
+    key: PRNGKeyArray,
+) -> dict[str, Array]:
+    """Objective of one run of one scene at x ± ε, and its derivative by the free numbers, in forward mode."""
+    scenario = scene(problem.scenes, lane["scene"])
+    # A run draws from the folds 0 to 2 of its key.
+    shift = spread * jax.random.normal(jax.random.fold_in(key, 3), free.shape, free.dtype)
+
+    def loss(free):
+        values = {
+            path: interval.to_parameter(x)
+            for path, interval, x in zip(problem.paths, problem.intervals, free, strict=True)
+        }
+        config = eqx.tree_at(lambda c: c.temperature, problem.config, temperature)
+        experiment = replace_at(Experiment(scenario, config), values)
+        value = problem.objective(experiment.scenario, *simulate_and_filter(experiment, key))
+        return value, value
+
+    gradient, value = jax.jacfwd(loss, has_aux=True)(free + lane["sign"] * shift)
+    return {"loss": value, "gradient": gradient, "shift": shift}
+
+
+def _average(runs: dict[str, np.ndarray], parameters: dict[str, float], temperature: float, spread: float) -> Step:
+    """Mean over the pairs that stayed finite, of both estimates of the gradient."""
+    loss, gradient, shift = (runs[name].reshape(-1, 2, *runs[name].shape[1:]) for name in ("loss", "gradient", "shift"))
+    is_finite = np.all(np.isfinite(loss), axis=1) & np.all(np.isfinite(gradient), axis=(1, 2))
+    loss, gradient, shift = loss[is_finite], gradient[is_finite], shift[is_finite, 0]
+    num = len(loss)
+    estimates = np.stack([gradient.mean(axis=1), (loss[:, 0] - loss[:, 1])[:, None] * shift / (2 * spread**2)])
+    if num > 1:
+        precision = 1.0 / np.maximum(estimates.var(axis=1, ddof=1), np.finfo(float).tiny)
+        weight = precision[0] / precision.sum(axis=0)
+        mean = weight * estimates[0].mean(axis=0) + (1.0 - weight) * estimates[1].mean(axis=0)
+    else:
+        weight = np.ones(len(parameters))
+        mean = estimates[0, 0] if num else np.full(len(parameters), np.nan)
+    of_pairs = loss.mean(axis=1)
+    return Step(
+        parameters,
+        temperature,
+        float(of_pairs.mean()) if num else np.nan,
+        float(of_pairs.std(ddof=1) / np.sqrt(num)) if num > 1 else np.nan,
+        dict(zip(parameters, mean.tolist(), strict=True)),
+        dict(zip(parameters, weight.tolist(), strict=True)),
+        int((~is_finite).sum()),
+    )

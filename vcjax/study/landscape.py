@@ -1,0 +1,134 @@
+"""The landscape of an objective over two numbers: a grid of settings, every point judged by hard decisions."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from vcjax.fields import require_key
+from vcjax.filter.config import FilterConfig
+from vcjax.simulation.scenarios import Scenario
+from vcjax.study.choice import Choice, Seeds, Setting, choose, setting_of
+from vcjax.study.evaluate import evaluate
+from vcjax.study.intervals import Interval
+from vcjax.study.losses import Objective
+from vcjax.study.results import import_xarray
+
+
+def search(
+    scenarios: Mapping[str, Scenario],
+    config: FilterConfig,
+    axes: Mapping[str, Sequence[float] | np.ndarray],
+    *,
+    objective: Objective | None = None,
+    seeds: Seeds | None = None,
+    key: PRNGKeyArray,
+    directory: str | Path | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Choice:
+    """Run a grid over two numbers, take its best point, and compare it with the setting that was there before.
+
+    Args:
+        scenarios: scenes by name, which differ in numbers only.
+        config: the filter; it decides hard.
+        axes: two paths of numeric leaves → the values they take.
+        objective: what is to be small; F1 of the tracks if None.
+        seeds: runs of each scene at every point, and of the comparison.
+        key: base key.
+        directory: where finished blocks are kept, and looked for.
+        progress: called with what is done, and how many settings of how many.
+
+    Raises:
+        ValueError: for arguments that make no sense, before anything compiles.
+        OSError: if the directory cannot be written.
+        ModuleNotFoundError: if xarray is not installed.
+    """
+    import_xarray()
+    require_key("search", key)
+    values = _axes(axes)
+    before = setting_of(scenarios, config, list(values))
+    grid = np.stack([axis.ravel() for axis in np.meshgrid(*values.values(), indexing="ij")], axis=1)
+    candidates = [before, *(dict(zip(values, point.tolist(), strict=True)) for point in grid)]
+    return choose(
+        scenarios,
+        config,
+        candidates,
+        objective=objective or Objective(),
+        seeds=seeds or Seeds(),
+        key=key,
+        directory=None if directory is None else Path(directory),
+        progress=progress,
+    )
+
+
+def as_grid(choice: Choice) -> Any:
+    """The candidates of a `search` with the two paths as dimensions: (x, y, scene, seed); `before` is left out."""
+    return _unstacked(choice.candidates.isel(setting=slice(1, None)), tuple(choice.before))
+
+
+def around(
+    scenarios: Mapping[str, Scenario],
+    config: FilterConfig,
+    setting: Setting,
+    intervals: Mapping[str, Interval],
+    *,
+    objective: Objective,
+    num_points: int,
+    num_seeds: int,
+    key: PRNGKeyArray,
+    directory: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Any:
+    """The landscape over two intervals, where the other numbers of a setting stay as they are.
+
+    Args:
+        scenarios: scenes by name.
+        config: the filter; it decides hard.
+        setting: numbers by their paths.
+        intervals: two of the paths, and between what values they go.
+        objective: what is drawn beside detection and position.
+        num_points: values along each interval, at least 2.
+        num_seeds: runs of each scene at every point.
+        key: base key.
+        directory: where finished blocks are kept.
+        progress: called with settings done, and settings in all.
+
+    Returns: runs (x, y, scene, seed), as `as_grid`.
+    """
+    part = np.linspace(0.02, 0.98, num_points)
+    axes = [[float(i.to_parameter(np.log(p / (1 - p)))) for p in part] for i in intervals.values()]
+    grid = dict(zip(intervals, (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")), strict=True))
+    rest = {path: np.full(num_points**2, value) for path, value in setting.items() if path not in grid}
+    runs = evaluate(
+        scenarios,
+        config,
+        grid | rest,
+        objective=objective,
+        num_seeds=num_seeds,
+        key=key,
+        directory=directory,
+        progress=progress,
+    )
+    return _unstacked(runs.drop_vars(list(rest)), tuple(intervals))
+
+
+def _unstacked(runs: Any, paths: tuple[str, ...]) -> Any:
+    """Settings as a grid over two paths."""
+    return runs.set_index(setting=list(paths)).unstack("setting").transpose(*paths, ...)
+
+
+def _axes(axes: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np.ndarray]:
+    """The grid's values.
+
+    Raises:
+        ValueError: unless they are two lists of numbers that differ.
+    """
+    if not isinstance(axes, Mapping) or len(axes) != 2:
+        raise ValueError(f"search(axes={axes!r}): give two paths with their values.")
+    values = {path: np.asarray(listed, float) for path, listed in axes.items()}
+    for path, listed in values.items():
+        if listed.ndim != 1 or listed.size == 0 or not np.all(np.isfinite(listed)) or np.any(np.diff(listed) <= 0):
+            raise ValueError(f"search(axes[{path!r}]={axes[path]!r}): give numbers in rising order.")
+    return values

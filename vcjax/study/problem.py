@@ -1,0 +1,102 @@
+"""What is tuned: an objective of runs in some scenes, as a function of free numbers."""
+
+from collections.abc import Callable, Iterator, Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from vcjax.fields import require_kind
+from vcjax.filter.config import FilterConfig
+from vcjax.simulation.scenarios import Scenario
+from vcjax.study.evaluate import stacked
+from vcjax.study.intervals import Interval
+from vcjax.study.losses import Objective
+from vcjax.study.sweep import Experiment, numeric_paths
+
+MAX_AMPLITUDE_M = 0.5
+"""How far a camera on a robot can be thought to swing to either side, m."""
+
+
+class Problem(eqx.Module):
+    """What is minimised: an objective of runs in some scenes, by numbers of scenario and configuration.
+
+    The numbers are the same in all scenes. `config` decides smoothly: `smoothing` is "soft" (a true gradient) or
+    "straight_through" (the hard filter's numbers).
+    """
+
+    scenes: Scenario
+    """All scenes, stacked (see `evaluate.stacked`)."""
+    config: FilterConfig
+    objective: Objective
+    paths: tuple[str, ...] = eqx.field(static=True)
+    """Which numbers are free."""
+    intervals: tuple[Interval, ...]
+    """Where each may go."""
+
+    def to_free(self, parameters: Mapping[str, float]) -> np.ndarray:
+        """The free numbers of some parameters.
+
+        Raises:
+            ValueError: for a parameter outside its interval.
+        """
+        return np.array([self._named(path, i.to_free, parameters[path]) for path, i in self._each()])
+
+    def to_parameters(self, free: np.ndarray) -> dict[str, float]:
+        """The parameters of some free numbers."""
+        return {path: float(i.to_parameter(jnp.asarray(x))) for (path, i), x in zip(self._each(), free, strict=True)}
+
+    def _each(self) -> Iterator[tuple[str, Interval]]:
+        return zip(self.paths, self.intervals, strict=True)
+
+    @staticmethod
+    def _named(path: str, function: Callable[[float], float], value: float) -> float:
+        try:
+            return function(value)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+
+def problem_of(
+    scenarios: Mapping[str, Scenario],
+    config: FilterConfig,
+    parameters: Mapping[str, Interval],
+    objective: Objective | None = None,
+) -> Problem:
+    """The problem of making an objective small by some parameters.
+
+    Args:
+        scenarios: scenes by name, which differ in numbers only.
+        config: the filter.
+        parameters: path of a numeric leaf, as in a sweep → where it may go.
+        objective: what to make small; soft F1 of the tracks if None.
+
+    Raises:
+        ValueError: for hard decisions, scenes that differ in structure, unknown paths, frequencies that the frame rate
+            cannot show, or amplitudes above `MAX_AMPLITUDE_M`.
+    """
+    scenes = stacked(scenarios)
+    require_kind("tune", "config", config, FilterConfig, "give a FilterConfig with smoothing='soft'.")
+    if config.smoothing == "hard" or config.reverse_mode:
+        raise ValueError(
+            f"tune(config.smoothing={config.smoothing!r}, config.reverse_mode={config.reverse_mode}): give "
+            "smoothing 'soft' or 'straight_through', which have a derivative, and reverse_mode=False."
+        )
+    if not isinstance(parameters, Mapping) or not parameters:
+        raise ValueError(f"tune(parameters={parameters!r}): give at least one path with its interval.")
+    rate = min(float(scenario.frame_rate_hz) for scenario in scenarios.values())
+    known = list(numeric_paths(Experiment(next(iter(scenarios.values())), config)))
+    for path, interval in parameters.items():
+        if path not in known:
+            raise ValueError(f"tune has no numeric leaf {path!r}; choose among: {', '.join(known)}.")
+        require_kind("tune", f"parameters[{path!r}]", interval, Interval, "give an Interval(low, high).")
+        if path == "scenario.oscillation.frequency_hz" and interval.high > rate / 2:
+            raise ValueError(
+                f"tune(parameters[{path!r}].high={interval.high:g}): f is below half the frame rate, {rate / 2:g} Hz."
+            )
+        if path == "scenario.oscillation.amplitude_m" and not 0 <= interval.low < interval.high <= MAX_AMPLITUDE_M:
+            raise ValueError(
+                f"tune(parameters[{path!r}]) from {interval.low:g} to {interval.high:g}: A is a swing of the camera, "
+                f"between 0 and {MAX_AMPLITUDE_M} m."
+            )
+    return Problem(scenes, config, objective or Objective(), tuple(parameters), tuple(parameters.values()))

@@ -1,0 +1,102 @@
+"""How well tracks are told apart by a score, at every threshold at once: ROC and precision–recall curves.
+
+The tracks of all runs are pooled: each counts once, with its run's weight. Intervals are by bootstrap over seeds, since
+the tracks of a run depend on each other: a resample draws as many seeds as there are, with replacement, and keeps all
+tracks of each. Equal numbers of seeds and resamples draw equal seeds, so that two settings can be compared in pairs.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+FALSE_RATES = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 61)])
+"""Shares of the static tracks called dynamic at which curves are given."""
+RECALLS = np.linspace(0.02, 1.0, 50)
+"""Shares of the movers found at which curves are given."""
+NUM_RESAMPLES = 1000
+_CONFIDENCE = 0.95
+
+
+class Tracks(NamedTuple):
+    """Scores beside labels, run by run."""
+
+    score: Float[np.ndarray, "seed n"]
+    """NaN of what does not count as a track."""
+    is_mover: Bool[np.ndarray, "seed n"]
+
+
+def recall_at(
+    tracks: Tracks,
+    false_rates: Float[np.ndarray, " r"] = FALSE_RATES,
+    weights: Float[np.ndarray, "b seed"] | None = None,
+) -> Float[np.ndarray, "b r"]:
+    """Share of the movers found when at most these shares of the static tracks are called dynamic: the ROC.
+
+    Args:
+        tracks: pooled tracks.
+        false_rates: in [0, 1].
+        weights: how often each seed counts, for each resample; once in the only one if None.
+
+    Returns: recall of each resample at each rate, the largest that a threshold allows; NaN without movers.
+    """
+    hits, false = _counts(tracks, weights)
+    with np.errstate(invalid="ignore"):
+        recall, false_rate = hits / hits[:, -1:], false / np.maximum(false[:, -1:], 1e-300)
+    places = np.stack([np.searchsorted(row, false_rates + 1e-12, side="right") - 1 for row in false_rate])
+    return np.take_along_axis(recall, places, axis=1)
+
+
+def precision_at(
+    tracks: Tracks,
+    recalls: Float[np.ndarray, " r"] = RECALLS,
+    weights: Float[np.ndarray, "b seed"] | None = None,
+) -> Float[np.ndarray, "b r"]:
+    """Share of movers among the tracks called dynamic when at least these shares of the movers are found.
+
+    Arguments and shape as of `recall_at`; recalls in (0, 1]. The largest that a threshold allows; NaN without movers.
+    """
+    hits, false = _counts(tracks, weights)
+    with np.errstate(invalid="ignore"):
+        recall, precision = hits / hits[:, -1:], hits / (hits + false)
+    # The best precision at this recall or any higher one.
+    best = np.flip(np.fmax.accumulate(np.flip(precision, axis=1), axis=1), axis=1)
+    places = np.stack([np.searchsorted(row, recalls - 1e-12) for row in recall])
+    places = np.minimum(places, recall.shape[1] - 1)
+    return np.where(np.isnan(recall[:, -1:]), np.nan, np.take_along_axis(best, places, axis=1))
+
+
+def resampled(
+    curve: Callable[..., np.ndarray], tracks: Tracks, levels: Float[np.ndarray, " r"], num: int = NUM_RESAMPLES
+) -> Float[np.ndarray, "b r"]:
+    """`recall_at` or `precision_at` of every resample; a few at a time, which bounds the memory."""
+    weights = resamples(len(tracks.score), num)
+    return np.concatenate([curve(tracks, levels, weights[i : i + 50]) for i in range(0, num, 50)])
+
+
+def resamples(num_seeds: int, num: int = NUM_RESAMPLES) -> Float[np.ndarray, "b seed"]:
+    """How often each seed is drawn in each resample; the same whenever asked."""
+    return np.random.default_rng(0).multinomial(num_seeds, np.full(num_seeds, 1 / num_seeds), num).astype(float)
+
+
+def interval(values: Float[np.ndarray, "b ..."]) -> Float[np.ndarray, "2 ..."]:
+    """Bounds of the central 95 % of resampled values (percentile bootstrap); NaN are left out."""
+    tail = (1 - _CONFIDENCE) / 2
+    with np.errstate(invalid="ignore"):
+        return np.nanquantile(values, [tail, 1 - tail], axis=0)
+
+
+def _counts(tracks: Tracks, weights: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Movers and others with a score of at least each that occurs, (b, m), from none to all."""
+    weights = np.ones((1, len(tracks.score))) if weights is None else weights
+    counts = ~np.isnan(tracks.score)
+    score, is_mover = tracks.score[counts], tracks.is_mover[counts]
+    seed = np.nonzero(counts)[0]
+    order = np.argsort(-score, kind="stable")
+    # Equal scores are called dynamic together.
+    is_last = np.append(np.diff(score[order]) != 0, True) if len(score) else np.zeros(0, bool)
+    weight = weights[:, seed[order]]
+    none = np.zeros((len(weights), 1))
+    hits, false = (np.cumsum(weight * chosen, axis=1)[:, is_last] for chosen in (is_mover[order], ~is_mover[order]))
+    return np.concatenate([none, hits], axis=1), np.concatenate([none, false], axis=1)

@@ -1,0 +1,48 @@
+"""The scenes that one setting of gate and camera has to serve at once."""
+
+import dataclasses
+from typing import Literal
+
+from vcjax.simulation.scenarios import DynamicMotion, RobotMotion, Scenario, paper
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenes:
+    """The paper's dynamic scenes: every motion of the dynamic features at every speed."""
+
+    motions: tuple[DynamicMotion, ...] = ("lateral", "inverse_forward")
+    """How the six dynamic features move."""
+    speeds_m_s: tuple[float, ...] = (1.0, 0.5, 0.25)
+    """Their speeds, m/s."""
+    robot: RobotMotion = "forward"
+    """How the robot moves."""
+    dynamic_set: Literal["ahead", "near_path"] = "ahead"
+    """Which six features move."""
+    amplitude_m: float = 0.05
+    """A of the oscillation, m (the paper: 0.05)."""
+    frequency_hz: float = 3.0
+    """f of the oscillation, Hz (the paper: 3)."""
+    num_frames: int = 160
+    """Frames in a run."""
+
+    def make(self) -> dict[str, Scenario]:
+        """The scenes by name, e.g. "inverse forward, 0.5 m/s".
+
+        Raises:
+            ValueError: if there is none, or for numbers out of range.
+        """
+        if not self.motions or not self.speeds_m_s:
+            raise ValueError(f"Scenes(motions={self.motions}, speeds_m_s={self.speeds_m_s}): give at least one each.")
+        return {
+            f"{motion.replace('_', ' ')}, {speed:g} m/s": paper(
+                robot=self.robot,
+                dynamic=motion,
+                dynamic_speed_m_s=speed,
+                dynamic_set=self.dynamic_set,
+                oscillation_amplitude_m=self.amplitude_m,
+                oscillation_frequency_hz=self.frequency_hz,
+                num_frames=self.num_frames,
+            )
+            for motion in self.motions
+            for speed in self.speeds_m_s
+        }
