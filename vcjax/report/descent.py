@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from vcjax.report.style import RC, new_figure
 from vcjax.study.descent import Step
@@ -32,6 +33,7 @@ def descent_figure(descents: Sequence[Sequence[Step]]) -> Figure:
         axes.set_title(name.split(".")[-1])
     for axes in panels:
         axes.set_xlabel("step")
+        axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     first, last = descents[0][0].temperature, descents[0][-1].temperature
     figure.suptitle(
         f"Descent by gradient, fresh seeds in every step, temperature {first:.2g} to {last:.2g}", fontsize=10

@@ -14,7 +14,7 @@ STYLES = {
     "after": {"color": "#009e73", "linestyle": "-"},
 }
 """How the two settings are drawn in all figures."""
-_LOWEST = 1e-3
+_RESAMPLES = 300
 
 
 @matplotlib.rc_context(RC)
@@ -61,16 +61,15 @@ def _tracks(choice: Choice) -> list[dict[str, roc.Tracks]]:
 
 
 def _draw(axes: Axes, levels: np.ndarray, curve, tracks: roc.Tracks, side: str, style: dict) -> None:
-    low, high = roc.interval(roc.resampled(curve, tracks, levels))
-    x = np.maximum(levels, _LOWEST) if curve is roc.recall_at else levels
-    axes.plot(x, curve(tracks, levels)[0], label=side, **style)
-    axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+    low, high = roc.interval(roc.resampled(curve, tracks, levels, _RESAMPLES))
+    axes.plot(levels, curve(tracks, levels)[0], label=side, **style)
+    axes.fill_between(levels, low, high, color=style["color"], alpha=0.18, linewidth=0)
 
 
 def _roc_axes(axes: Axes) -> None:
     axes.axvline(FALSE_RATE, color="#b3b3b3", linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
-    axes.set_xlim(_LOWEST, 1)
+    axes.set_xlim(roc.FALSE_RATES[0], 1)
     axes.set_ylim(0, 1.02)
     axes.set_xlabel("static tracks called dynamic")
     axes.set_ylabel("movers found")

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from vcjax.report.style import RC, new_figure
 
@@ -41,12 +41,13 @@ def landscape_figure(
         marks: settings to mark, by name.
         paths: settings one after another, drawn as lines: the paths of descents.
     """
-    x, y = (str(dim) for dim in list(grid.dims)[:2])
+    x, y = (str(dim) for dim in grid.loss.dims[:2])
     figure = new_figure(8.6, 6.6)
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
+    edges = _edges(grid[x].values), _edges(grid[y].values)
     for axes, (name, (label, colours)) in zip(panels.flat, PANELS.items(), strict=True):
         values = grid[name].mean(("scene", "seed")).transpose(y, x)
-        image = axes.pcolormesh(grid[x], grid[y], values, cmap=colours, shading="nearest", rasterized=True)
+        image = axes.pcolormesh(*edges, values, cmap=colours, shading="flat", rasterized=True)
         figure.colorbar(image, ax=axes)
         axes.grid(False)
         axes.set_title(label)
@@ -69,16 +70,28 @@ def landscape_figure(
     return figure
 
 
+def _is_log(values: np.ndarray) -> bool:
+    """Whether values are spread by equal factors."""
+    return len(values) > 2 and values[0] > 0 and np.ptp(np.diff(np.log(values))) < 1e-6
+
+
+def _edges(values: np.ndarray) -> np.ndarray:
+    """Ends of the cells around values, half-way between them on the axis that they are drawn on."""
+    if len(values) < 2:
+        return values[0] + np.array([-0.5, 0.5])
+    if _is_log(values):
+        return np.exp(_edges(np.log(values)))
+    middle = (values[1:] + values[:-1]) / 2
+    return np.concatenate([[2 * values[0] - middle[0]], middle, [2 * values[-1] - middle[-1]]])
+
+
 def _scale(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
     """A logarithmic scale where the values are spread so."""
-    for values, set_scale, axis, limit in (
-        (x, axes.set_xscale, axes.xaxis, axes.set_xlim),
-        (y, axes.set_yscale, axes.yaxis, axes.set_ylim),
-    ):
-        if len(values) > 2 and values[0] > 0 and np.ptp(np.diff(np.log(values))) < 1e-6:
+    for values, set_scale, axis in ((x, axes.set_xscale, axes.xaxis), (y, axes.set_yscale, axes.yaxis)):
+        if _is_log(values):
             set_scale("log")
             axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.set_major_formatter(ScalarFormatter())
-            axis.set_minor_locator(LogLocator(subs=()))
-            half = np.sqrt(values[1] / values[0])
-            limit(values[0] / half, values[-1] * half)
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_locator(NullLocator())
+    axes.set_xlim(*_edges(x)[[0, -1]])
+    axes.set_ylim(*_edges(y)[[0, -1]])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-FALSE_RATES = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 61)])
+FALSE_RATES = np.geomspace(1e-3, 1.0, 61)
 """Shares of the static tracks called dynamic at which curves are given."""
 RECALLS = np.linspace(0.02, 1.0, 50)
 """Shares of the movers found at which curves are given."""
