@@ -63,6 +63,8 @@ class Sweep:
 
     def __call__(self, console: Console) -> None:
         """Run, draw, report."""
+        if self.x == self.y:
+            raise ValueError(f"--x {self.x} --y {self.y}: give two numbers.")
         axes = {
             self.x: _values("x", self.x_range, self.x_points, self.x_log),
             self.y: _values("y", self.y_range, self.y_points, self.y_log),

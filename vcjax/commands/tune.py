@@ -69,6 +69,8 @@ class Tune:
 
     def __call__(self, console: Console) -> None:
         """Tune, draw, report."""
+        if self.landscape_points == 1 or self.landscape_points < 0:
+            raise ValueError(f"--landscape-points {self.landscape_points}: give at least 2, or 0 for no landscape.")
         oscillation = {
             "scenario.oscillation.amplitude_m": Interval(0.0, self.max_amplitude_m),
             "scenario.oscillation.frequency_hz": Interval(*self.frequency_band_hz),

@@ -52,7 +52,7 @@ def comparison(choice: Choice) -> dict[str, Any]:
         paired[name] = _difference(scenes[0][name], scenes[1][name])
         recall = [_recall(track[name]) for track in tracks]
         for figures, (value, samples) in zip(found, recall, strict=True):
-            figures[RECALL] = {"mean": value, "se": float(np.nanstd(samples))}
+            figures[RECALL] = {"mean": value, "se": float(np.std(samples))}
         lower, upper = roc.interval(recall[1][1] - recall[0][1])
         paired[name][RECALL] = {
             "mean": recall[1][0] - recall[0][0],

@@ -72,7 +72,7 @@ def landscape_figure(
 
 def _is_log(values: np.ndarray) -> bool:
     """Whether values are spread by equal factors."""
-    return len(values) > 2 and values[0] > 0 and np.ptp(np.diff(np.log(values))) < 1e-6
+    return len(values) > 2 and bool(values[0] > 0 and np.ptp(np.diff(np.log(values))) < 1e-6)
 
 
 def _edges(values: np.ndarray) -> np.ndarray:

@@ -61,6 +61,16 @@ class Seeds(NamedTuple):
     held_out: int = 100
     """To compare the choice with what was there before."""
 
+    def check(self) -> None:
+        """Refuse empty sets.
+
+        Raises:
+            ValueError: naming which, and what to give.
+        """
+        for name, number in self._asdict().items():
+            if not isinstance(number, int | np.integer) or number < 1:
+                raise ValueError(f"Seeds({name}={number!r}): give a whole number of at least 1.")
+
 
 def choose(
     scenarios: Mapping[str, Scenario],
@@ -88,9 +98,7 @@ def choose(
     Raises:
         ValueError: as `evaluate`; for an empty set of seeds, or if no candidate has a finite run.
     """
-    for name, number in seeds._asdict().items():
-        if not isinstance(number, int | np.integer) or number < 1:
-            raise ValueError(f"Seeds({name}={number!r}): give a whole number of at least 1.")
+    seeds.check()
     choosing_key, held_out_key = jax.random.split(key)
 
     def judge(name: str, settings: Sequence[Setting], num_seeds: int, key) -> Any:

@@ -3,6 +3,8 @@
 θ = l + (u - l) σ(x), or on a logarithmic scale θ = l (u/l)^σ(x), with x any number and σ the logistic function.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -26,7 +28,10 @@ class Interval(eqx.Module):
 
     def to_parameter(self, free: Float[Array, ""]) -> Float[Array, ""]:
         """θ(x). Derivative exact."""
-        part = jax.nn.sigmoid(free)
+        return self.at(jax.nn.sigmoid(free))
+
+    def at(self, part: Any) -> Any:
+        """The parameter at a part of the interval, from 0 (low) to 1 (high), on its scale. Derivative exact."""
         if self.is_log:
             return self.low * (self.high / self.low) ** part
         return self.low + (self.high - self.low) * part

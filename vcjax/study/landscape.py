@@ -97,8 +97,7 @@ def around(
 
     Returns: runs (x, y, scene, seed), as `as_grid`.
     """
-    part = np.linspace(0.02, 0.98, num_points)
-    axes = [[float(i.to_parameter(np.log(p / (1 - p)))) for p in part] for i in intervals.values()]
+    axes = [interval.at(np.linspace(0.02, 0.98, num_points)) for interval in intervals.values()]
     grid = dict(zip(intervals, (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")), strict=True))
     rest = {path: np.full(num_points**2, value) for path, value in setting.items() if path not in grid}
     runs = evaluate(

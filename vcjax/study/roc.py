@@ -81,10 +81,9 @@ def resamples(num_seeds: int, num: int = NUM_RESAMPLES) -> Float[np.ndarray, "b 
 
 
 def interval(values: Float[np.ndarray, "b ..."]) -> Float[np.ndarray, "2 ..."]:
-    """Bounds of the central 95 % of resampled values (percentile bootstrap); NaN are left out."""
+    """Bounds of the central 95 % of resampled values (percentile bootstrap); NaN where any of them is."""
     tail = (1 - _CONFIDENCE) / 2
-    with np.errstate(invalid="ignore"):
-        return np.nanquantile(values, [tail, 1 - tail], axis=0)
+    return np.quantile(values, [tail, 1 - tail], axis=0)
 
 
 def _counts(tracks: Tracks, weights: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -91,6 +91,8 @@ def tune(
     schedule, directory = schedule or Schedule(), None if directory is None else Path(directory)
     if not isinstance(num_starts, int | np.integer) or num_starts < 1:
         raise ValueError(f"tune(num_starts={num_starts!r}): give a whole number of at least 1.")
+    seeds = seeds or Seeds()
+    seeds.check()
     problem = problem_of(scenarios, config, parameters, objective)
     starts = _starts(problem, setting_of(scenarios, config, problem.paths), num_starts)
     origin = _origin(scenarios, problem, schedule, key)
@@ -120,7 +122,7 @@ def tune(
         config,
         [starts[0], *(end_of(problem, steps) for steps in descents)],
         objective=problem.objective,
-        seeds=seeds or Seeds(),
+        seeds=seeds,
         key=choice_key,
         directory=directory,
         progress=progress,
@@ -133,8 +135,9 @@ def _starts(problem: Problem, before: dict[str, float], num: int) -> list[dict[s
     """Where the descents begin."""
     problem.to_free(before)
     spread = qmc.Halton(len(problem.paths), scramble=False).random(num)[1:]  # its first point is a corner
-    part = _MARGIN + (1 - 2 * _MARGIN) * spread
-    return [before, *(problem.to_parameters(np.log(row / (1 - row))) for row in part)]
+    parts = _MARGIN + (1 - 2 * _MARGIN) * spread
+    each = list(zip(problem.paths, problem.intervals, strict=True))
+    return [before, *({path: float(i.at(p)) for (path, i), p in zip(each, row, strict=True)} for row in parts)]
 
 
 def _origin(scenarios, problem: Problem, schedule: Schedule, key) -> dict[str, Any]:

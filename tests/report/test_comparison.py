@@ -1,0 +1,124 @@
+"""A comparison of settings against SciPy, as JSON, as Markdown, and as figures."""
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+from vcjax.report.comparison import comparison, comparison_markdown
+from vcjax.report.landscape import PANELS, landscape_figure
+from vcjax.report.tuning import write_search, write_tuning
+from vcjax.study.choice import ALL, COMPARED, RECALL, Choice
+from vcjax.study.descent import Step
+from vcjax.study.landscape import as_grid
+from vcjax.study.tune import Tuned
+
+TH1, TH2 = "config.gate.th1", "config.gate.th2"
+SCENES = ["lateral, 1 m/s", "inverse forward, 1 m/s"]
+NUM_FEATURES = 12
+
+
+def invented(settings: list[tuple[float, float]], num_seeds: int) -> xr.Dataset:
+    """Runs as `evaluate` gives them: noise shared by the settings, of which the later ones are better."""
+    rng = np.random.default_rng(0)
+    dims, shape = ("setting", "scene", "seed"), (len(settings), len(SCENES), num_seeds)
+    shared, better = rng.normal(size=shape[1:]), np.arange(len(settings))[:, None, None]
+    own = 0.1 * rng.normal(size=shape)
+    figures = {name: (dims, 5.0 + shared - 0.5 * better + own) for name in COMPARED}
+    figures["detection_delay_frames"] = (dims, np.where(own > 0.1, np.nan, 3.0 + own))
+    is_moving = np.zeros((len(SCENES), NUM_FEATURES), bool)
+    is_moving[:, :4] = True
+    margin = rng.normal(size=(*shape, NUM_FEATURES)) + is_moving[:, None] * (1 + better[..., None])
+    return xr.Dataset(
+        figures
+        | {
+            "is_finite": (dims, np.ones(shape, bool)),
+            "map_full_frames": (dims, np.zeros(shape, int)),
+            "dynamic_margin": ((*dims, "feature"), margin),
+            "is_moving": (("scene", "feature"), is_moving),
+        },
+        {
+            "setting": np.arange(len(settings)),
+            "scene": SCENES,
+            "seed": np.arange(num_seeds),
+            TH1: ("setting", [th1 for th1, _ in settings]),
+            TH2: ("setting", [th2 for _, th2 in settings]),
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def choice() -> Choice:
+    points = [(9.0, 9.0), *((a, b) for a in (4.0, 8.0, 16.0) for b in (3.0, 9.0, 27.0))]
+    before, after = ({TH1: th1, TH2: th2} for th1, th2 in (points[0], points[-1]))
+    return Choice(before, after, invented(points, 3), invented([points[0], points[-1]], 30))
+
+
+def test_means_and_paired_intervals_are_those_of_scipy(choice):
+    compared = comparison(choice)
+    assert list(compared["paired"]) == [*SCENES, ALL] and compared["held_out_seeds"] == 30
+    assert compared["runs"] == {"choosing": 60, "held_out": 120, "failed": 0, "map_full": 0}
+    for name in COMPARED:
+        for scene in (*SCENES, ALL):
+            runs = choice.held_out[name]
+            runs = runs.mean("scene") if scene == ALL else runs.sel(scene=scene)
+            before, after = (runs.sel(setting=i).values for i in (0, 1))
+            found = compared["after"]["metrics"][scene][name]
+            np.testing.assert_allclose(found["mean"], np.nanmean(after), rtol=1e-12)
+            np.testing.assert_allclose(found["se"], stats.sem(after, nan_policy="omit"), rtol=1e-12)
+            difference = (after - before)[np.isfinite(after - before)]
+            interval = stats.t.interval(0.95, len(difference) - 1, difference.mean(), stats.sem(difference))
+            paired = compared["paired"][scene][name]
+            assert paired["num_pairs"] == len(difference)
+            np.testing.assert_allclose([paired["lower"], paired["upper"]], interval, rtol=1e-9)
+    assert compared["after"]["loss"] == compared["after"]["metrics"][ALL]["loss"]
+    recall = compared["paired"][ALL][RECALL]
+    assert recall["lower"] < recall["mean"] < recall["upper"] and recall["mean"] > 0
+
+
+def test_markdown_tells_what_is_decided(choice):
+    compared = comparison(choice)
+    text = comparison_markdown(compared)
+    assert "| `config.gate.th2` | 9 | 27 |" in text and "30 seeds held out" in text
+    line = next(line for line in text.splitlines() if line.startswith("| all scenes | ") and "cm" not in line)
+    f1 = compared["after"]["metrics"][ALL]["detection_f1"]["mean"]
+    assert f"→ {f1:.3f} [" in line and line.split(" | ")[1].startswith("**")
+
+
+def test_search_and_tuning_are_written_whole(choice, tmp_path):
+    paths = write_search(choice, tmp_path / "sweep")
+    assert all(path.is_file() and path.stat().st_size > 0 for path in paths)
+    content = json.loads((tmp_path / "sweep" / "sweep.json").read_text())
+    assert content["grid_dimensions"] == [TH1, TH2] and np.shape(content["grid"]["detection_f1"]) == (3, 3)
+    np.testing.assert_allclose(content["grid"]["loss"], as_grid(choice).loss.mean(("scene", "seed")))
+    figures = {path.name for path in paths if path.suffix == ".png"}
+    assert figures == {
+        "landscape.png", "landscape_scene_1.png", "landscape_scene_2.png", "curves.png", "roc_by_scene.png"
+    }  # fmt: skip
+
+    steps = [Step({TH1: 9.0 + k, TH2: 9.0 - k}, 1.0, 0.5, np.nan, {TH1: 0.1, TH2: 0.2}, {}, k) for k in range(3)]
+    steps.append(Step({TH1: 12.0, TH2: 6.0}, 1.0, np.nan, np.nan, {TH1: np.nan, TH2: np.nan}, {}, 4))
+    paths = write_tuning(Tuned([steps, steps], choice, 64), {"thresholds": as_grid(choice)}, tmp_path / "tune")
+    content = json.loads((tmp_path / "tune" / "tune.json").read_text())
+    assert content["before"]["parameters"] == choice.before and content["after"]["parameters"] == choice.after
+    assert content["history"][1][2]["parameters"] == {TH1: 11.0, TH2: 7.0}
+    assert content["history"][0][3]["loss"] is None and (content["steps_skipped"], content["pairs_failed"]) == (2, 14)
+    assert {"before", "after", "history", "paired"} <= set(content)
+    figures = {path.name for path in paths if path.suffix == ".png"}
+    assert figures == {"descent.png", "landscape_thresholds.png", "curves.png", "roc_by_scene.png"}
+
+
+def test_the_landscape_shows_every_mean_in_its_place(choice):
+    grid = as_grid(choice)
+    figure = landscape_figure(grid, "title", {"before": choice.before, "after": choice.after}, [[choice.before] * 2])
+    for axes, name in zip(figure.axes, PANELS, strict=False):
+        (mesh,) = axes.collections
+        np.testing.assert_allclose(mesh.get_array(), grid[name].mean(("scene", "seed")).T)
+        corners = mesh.get_coordinates()
+        np.testing.assert_allclose(corners[0, 0], [4 / np.sqrt(2), 3 / np.sqrt(3)])
+        np.testing.assert_allclose(corners[-1, -1], [16 * np.sqrt(2), 27 * np.sqrt(3)])
+        assert axes.get_xscale() == axes.get_yscale() == "log"
+    linear = grid.assign_coords({TH1: [1.0, 2.0, 3.0]})
+    assert landscape_figure(linear, "title").axes[0].get_xlim() == (0.5, 3.5)

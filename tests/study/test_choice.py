@@ -1,0 +1,159 @@
+"""The choice among settings, a search on a grid, tuning: what is chosen, on which seeds, and going on after a stop."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+import tiny_runs
+import xarray as xr
+
+import vcjax as vc
+from vcjax.study import choice as module
+from vcjax.study import descent
+from vcjax.study.choice import ALL, Choice, Seeds, by_scene, choose, setting_of, tracks_of
+from vcjax.study.descent import Schedule, end_of
+from vcjax.study.intervals import Interval
+from vcjax.study.landscape import around, as_grid, search
+from vcjax.study.losses import Objective
+from vcjax.study.problem import problem_of
+from vcjax.study.tune import tune
+
+KEY = jax.random.key(5)
+SCENES = {f"{v} m/s": tiny_runs.scenario(dynamic_speed_m_s=v, num_frames=8) for v in (0.5, 1.0)}
+SOFT = tiny_runs.config(tiny_runs.STRICT, smoothing="soft")
+OBJECTIVE = Objective(track_f1=1.0, position=2.0)
+TH1, TH2 = "config.gate.th1", "config.gate.th2"
+INTERVALS = {TH1: Interval(0.2, 50.0, is_log=True), TH2: Interval(0.1, 20.0, is_log=True)}
+SEEDS = Seeds(2, 3)
+
+
+@pytest.fixture(scope="module")
+def found() -> Choice:
+    return search(SCENES, SOFT, {TH1: [0.5, 4.0], TH2: [0.4, 1.0, 6.0]}, objective=OBJECTIVE, seeds=SEEDS, key=KEY)
+
+
+def test_the_best_candidate_is_chosen_and_compared_on_other_seeds(found):
+    assert found.before == {TH1: 1.0, TH2: 0.7} == setting_of(SCENES, SOFT, [TH1, TH2])
+    loss = found.candidates.loss.mean(("scene", "seed")).values
+    assert loss.shape == (7,) and len(set(loss)) > 3
+    best = found.candidates.isel(setting=int(np.argmin(loss)))
+    assert found.after == {TH1: float(best[TH1]), TH2: float(best[TH2])}
+    assert dict(found.held_out.loss.sizes) == {"setting": 2, "scene": 2, "seed": 3}
+    assert not np.isin(found.held_out.loss.values, found.candidates.loss.values).any()
+    other = choose(SCENES, SOFT, [found.before], objective=OBJECTIVE, seeds=SEEDS, key=KEY)
+    assert other.after == other.before
+    # The seeds held out do not depend on the candidates.
+    np.testing.assert_array_equal(other.held_out.loss[0], found.held_out.loss[0])
+
+
+def test_a_grid_has_its_two_numbers_as_dimensions(found):
+    grid = as_grid(found)
+    assert grid.loss.dims == (TH1, TH2, "scene", "seed") and grid.loss.shape == (2, 3, 2, 2)
+    for i, point in enumerate(found.candidates.setting.values[1:], start=1):
+        one = found.candidates.isel(setting=i)
+        same = grid.sel({TH1: float(one[TH1]), TH2: float(one[TH2])})
+        np.testing.assert_array_equal(same.loss, one.loss)
+        assert point == i
+
+
+def test_figures_and_tracks_of_each_scene_and_of_all(found):
+    runs = found.held_out.isel(setting=1)
+    scenes, tracks = by_scene(runs), tracks_of(runs)
+    assert list(scenes) == list(tracks) == [*SCENES, ALL]
+    np.testing.assert_allclose(scenes[ALL].detection_f1, runs.detection_f1.mean("scene"))
+    for name in SCENES:
+        one = runs.sel(scene=name)
+        np.testing.assert_array_equal(scenes[name].position_rmse_cm, one.position_rmse_cm)
+        np.testing.assert_array_equal(tracks[name].score, one.dynamic_margin)
+        np.testing.assert_array_equal(tracks[name].is_mover, np.tile(one.is_moving, (3, 1)))
+    np.testing.assert_array_equal(tracks[ALL].score, np.concatenate([tracks[name].score for name in SCENES], axis=1))
+
+
+def test_the_landscape_around_a_setting_keeps_the_other_numbers(found):
+    setting = {TH1: 3.0, TH2: 0.7, "scenario.oscillation.amplitude_m": 0.02}
+    grid = around(SCENES, SOFT, setting, INTERVALS, objective=OBJECTIVE, num_points=2, num_seeds=2, key=KEY)
+    assert grid.loss.dims == (TH1, TH2, "scene", "seed") and grid.loss.shape == (2, 2, 2, 2)
+    np.testing.assert_allclose(grid[TH1], [0.2 * 250**0.02, 0.2 * 250**0.98])
+
+
+def test_runs_that_all_fail_are_refused(found, monkeypatch):
+    failed = found.candidates.assign(loss=found.candidates.loss * np.nan)
+    monkeypatch.setattr(module, "evaluate", lambda *_, **__: failed)
+    with pytest.raises(ValueError, match="no run of any candidate stayed finite"):
+        choose(SCENES, SOFT, [found.before], objective=OBJECTIVE, seeds=SEEDS, key=KEY)
+
+
+def test_bad_searches_are_refused(unchecked):
+    for axes, seeds, message in (
+        ({TH1: [1.0, 2.0]}, SEEDS, "give two paths with their values"),
+        ({TH1: [2.0, 1.0], TH2: [1.0]}, SEEDS, r"search\(axes\['config.gate.th1'\].*in rising order"),
+        ({TH1: [1.0], TH2: []}, SEEDS, "in rising order"),
+        ({TH1: [1.0], "config.gate.th3": [1.0]}, SEEDS, "no number at 'config.gate.th3'"),
+        ({TH1: [1.0], TH2: [1.0]}, Seeds(0, 3), r"Seeds\(choosing=0\): give a whole number of at least 1"),
+        ({TH1: [1.0], TH2: [1.0]}, Seeds(2, 0), r"Seeds\(held_out=0\)"),
+        ({TH1: [1.0], "scenario.movers.speed_m_s": [1.0]}, SEEDS, r"is \[0.5, 1.0\] in the scenes; give all the same"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            search(SCENES, SOFT, axes, seeds=seeds, key=KEY)
+
+
+def tuned(directory=None, **options):
+    arguments = {
+        "objective": OBJECTIVE,
+        "schedule": Schedule(num_steps=2, pairs_per_step=1),
+        "num_starts": 2,
+        "seeds": SEEDS,
+        "key": KEY,
+        "directory": directory,
+    }
+    return tune(SCENES, SOFT, INTERVALS, **arguments | options)
+
+
+def test_tuning_descends_from_each_start_chooses_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    whole = tuned()
+    first, second = whole.descents
+    assert first[0].parameters == {TH1: pytest.approx(1.0), TH2: pytest.approx(0.7)}
+    assert second[0].parameters != first[0].parameters and first[0].loss != second[0].loss
+    problem = problem_of(SCENES, SOFT, INTERVALS, OBJECTIVE)
+    ends = [setting_of(SCENES, SOFT, [TH1, TH2]), *(end_of(problem, steps) for steps in whole.descents)]
+    for path in (TH1, TH2):
+        np.testing.assert_allclose(whole.choice.candidates[path], [end[path] for end in ends], rtol=1e-12)
+    assert whole.choice.after in ends
+    assert (whole.num_runs, whole.num_skipped, whole.num_failed) == (2 * 2 * 2 * 2, 0, 0)
+
+    def stop(name, done, total):
+        if (name, done) == ("descent 2 of 2", 1):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tuned(tmp_path, progress=stop)
+    assert len(json.loads((tmp_path / "descents" / "start_1.json").read_text())["steps"]) == 1
+    steps, average = [], descent._average
+    monkeypatch.setattr(descent, "_average", lambda *given: steps.append(given) or average(*given))
+    again = tuned(tmp_path)
+    assert len(steps) == 1 and again.descents == whole.descents and again.choice.after == whole.choice.after
+    xr.testing.assert_identical(again.choice.held_out, whole.choice.held_out)
+    assert tuned(tmp_path).descents == whole.descents and len(steps) == 1
+
+    with pytest.raises(ValueError, match=r"start_0\.json is of another schedule; give another directory"):
+        tuned(tmp_path, schedule=Schedule(num_steps=3, pairs_per_step=1))
+    (tmp_path / "descents" / "start_0.json").write_text('{"origin": {}')
+    with pytest.raises(ValueError, match=r"start_0\.json: no steps of a descent"):
+        tuned(tmp_path)
+
+
+def test_bad_tuning_is_refused_before_any_work(monkeypatch, unchecked):
+    monkeypatch.setattr(descent, "run_lanes", lambda *_: pytest.fail("worked"))
+    for options, message in (
+        ({"num_starts": 0}, r"num_starts=0\): give a whole number of at least 1"),
+        ({"key": 0}, r"key=0\)"),
+        ({"seeds": Seeds(0, 1)}, r"Seeds\(choosing=0\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            tuned(**options)
+    with pytest.raises(ValueError, match=r"config.gate.th1: Interval\(2, 3\): 1 is not inside"):
+        tune(SCENES, SOFT, {TH1: Interval(2.0, 3.0)}, key=KEY)
+    with pytest.raises(ValueError, match=r"is \[0.5, 1.0\] in the scenes"):
+        tune(SCENES, SOFT, {"scenario.movers.speed_m_s": Interval(0.1, 2)}, key=KEY)
+    assert vc.FilterConfig().smoothing == "hard"

@@ -1,0 +1,168 @@
+"""Descent: parameters that stay valid, gradients of the averaged objective, steps that go down, what is left out."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tiny_runs
+from hypothesis import given
+from hypothesis import strategies as st
+
+import vcjax as vc
+from vcjax.study import descent as module
+from vcjax.study.descent import Schedule, descend, end_of
+from vcjax.study.intervals import OSCILLATION, THRESHOLDS, Interval
+from vcjax.study.losses import Objective
+from vcjax.study.problem import problem_of
+
+KEY = jax.random.key(3)
+SCENES = {
+    f"{v} m/s": tiny_runs.scenario(oscillation_amplitude_m=0.05, dynamic_speed_m_s=v, num_frames=8) for v in (0.5, 1.0)
+}
+SOFT = tiny_runs.config(tiny_runs.STRICT, smoothing="soft")
+TH1, A, F = "config.gate.th1", *OSCILLATION
+PARAMETERS = {TH1: Interval(0.2, 50.0, is_log=True), **OSCILLATION}
+START = {TH1: 1.0, A: 0.05, F: 3.0}
+OBJECTIVE = Objective(track_f1=1.0, position=5.0, camera_motion=0.1)
+PROBLEM = problem_of(SCENES, SOFT, PARAMETERS, OBJECTIVE)
+ONE_STEP = Schedule(num_steps=1, pairs_per_step=2, learning_rate=0.2)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(1.001, 1e3), st.booleans(), st.floats(-30, 30))
+def test_intervals_map_every_number_inside_and_back(low, factor, is_log, free):
+    interval = Interval(low, factor * low, is_log)
+    parameter = float(interval.to_parameter(jnp.asarray(free)))
+    assert interval.low * (1 - 1e-9) <= parameter <= interval.high * (1 + 1e-9)
+    if abs(free) < 10:
+        assert interval.to_free(parameter) == pytest.approx(free, abs=1e-5)
+    slope = float(jax.grad(interval.to_parameter)(jnp.asarray(free)))
+    assert np.isfinite(slope) and slope >= 0
+
+
+def test_a_step_averages_both_estimates_over_the_pairs_and_goes_down():
+    """Against runs made one by one here: the loss at x ± ε, its finite differences, and the weights of the two."""
+    (step,) = descend(PROBLEM, START, ONE_STEP, key=KEY)
+    free, sigma, h = PROBLEM.to_free(START), ONE_STEP.spread, 1e-5
+
+    def loss(number, seed, free):
+        lane = {"scene": jnp.asarray(number), "sign": jnp.asarray(1.0)}
+        key = jax.random.fold_in(jax.random.fold_in(KEY, 0), seed)
+        return float(plain(PROBLEM, free, jnp.asarray(0.0), jnp.asarray(ONE_STEP.temperature(0)), lane, key)["loss"])
+
+    plain = jax.jit(module._value_and_gradient)
+    losses, pathwise, of_pairs = [], [], []
+    for seed in range(4):
+        key = jax.random.fold_in(jax.random.fold_in(KEY, 0), seed)
+        shift = sigma * np.asarray(jax.random.normal(jax.random.fold_in(key, 3), (3,)))
+        pair = [loss(seed // 2, seed, free + sign * shift) for sign in (1, -1)]
+        slopes = [
+            [
+                (loss(seed // 2, seed, free + sign * shift + d) - loss(seed // 2, seed, free + sign * shift - d))
+                / (2 * h)
+                for d in h * np.eye(3)
+            ]
+            for sign in (1, -1)
+        ]
+        losses.append(np.mean(pair))
+        pathwise.append(np.mean(slopes, axis=0))
+        of_pairs.append((pair[0] - pair[1]) * shift / (2 * sigma**2))
+    assert (step.loss, step.num_failed) == (pytest.approx(np.mean(losses), rel=1e-9), 0)
+    assert step.loss_se == pytest.approx(np.std(losses, ddof=1) / 2, rel=1e-9)
+    weight = 1 / np.var(pathwise, axis=0, ddof=1)
+    weight = weight / (weight + 1 / np.var(of_pairs, axis=0, ddof=1))
+    np.testing.assert_allclose(list(step.pathwise.values()), weight, rtol=1e-3)
+    expected = weight * np.mean(pathwise, axis=0) + (1 - weight) * np.mean(of_pairs, axis=0)
+    np.testing.assert_allclose(list(step.gradient.values()), expected, rtol=1e-3, atol=1e-5)
+
+
+def test_the_first_step_of_adam_is_the_sign_of_the_gradient():
+    first, second = descend(PROBLEM, START, dataclasses.replace(ONE_STEP, num_steps=2), key=KEY)
+    assert first.parameters == {path: pytest.approx(value) for path, value in START.items()}
+    moved = PROBLEM.to_free(second.parameters) - PROBLEM.to_free(first.parameters)
+    np.testing.assert_allclose(moved, -0.2 * np.sign(list(first.gradient.values())), rtol=1e-5)
+
+
+def test_steps_draw_new_seeds_the_temperature_falls_and_a_stopped_descent_goes_on():
+    schedule = Schedule(num_steps=3, pairs_per_step=1, temperature_start=4.0, temperature_end=1.0)
+    told = []
+    steps = descend(PROBLEM, START, schedule, key=KEY, progress=told.append)
+    assert [step.temperature for step in steps] == pytest.approx([4.0, 2.0, 1.0])
+    assert told == [steps[:1], steps[:2], steps]
+    assert len({step.loss for step in steps}) == 3
+    assert descend(PROBLEM, START, schedule, key=KEY, history=steps[:2]) == steps
+    assert descend(PROBLEM, START, schedule, key=KEY, history=steps) == steps
+    for path, interval in PARAMETERS.items():
+        assert all(interval.low < step.parameters[path] < interval.high for step in steps)
+
+
+def test_the_end_is_the_mean_of_the_last_quarter_in_the_free_numbers():
+    free = np.arange(24.0).reshape(8, 3) / 20
+    steps = [module.Step(PROBLEM.to_parameters(x), 1.0, 0.0, 0.0, {}, {}, 0) for x in free]
+    np.testing.assert_allclose(PROBLEM.to_free(end_of(PROBLEM, steps)), free[6:].mean(axis=0), rtol=1e-9)
+
+
+def broken_after(num_calls: int, monkeypatch):
+    """Runs that went non-finite: all of them after so many calls, one of two pairs before."""
+    calls = []
+
+    def run_lanes(*_, **__):
+        calls.append(len(calls))
+        runs = {"loss": np.array([1.0, 2.0, np.nan, 3.0]), "gradient": np.ones((4, 3)), "shift": np.ones((4, 3))}
+        return runs if len(calls) <= num_calls else {name: np.full_like(v, np.nan) for name, v in runs.items()}
+
+    monkeypatch.setattr(module, "run_lanes", run_lanes)
+
+
+def test_what_goes_non_finite_is_left_out_and_counted(monkeypatch):
+    broken_after(1, monkeypatch)
+    first, *rest = descend(PROBLEM, START, dataclasses.replace(ONE_STEP, num_steps=3), key=KEY)
+    assert (first.loss, first.num_failed) == (1.5, 1)
+    assert list(first.gradient.values()) == [1.0, 1.0, 1.0]  # of a single pair the pathwise one alone
+    assert all(step.num_failed == 2 and np.isnan(step.loss) for step in rest)
+    assert rest[0].parameters == rest[1].parameters  # no step was taken from there
+
+
+def test_an_objective_that_is_not_finite_at_the_start_is_refused(monkeypatch):
+    broken_after(0, monkeypatch)
+    with pytest.raises(ValueError, match=r"not finite at the start, {'config.gate.th1': 1.0"):
+        descend(PROBLEM, START, ONE_STEP, key=KEY)
+
+
+def test_bad_problems_are_refused(unchecked):
+    for arguments, message in (
+        ({"config": tiny_runs.config()}, r"smoothing='hard'.*'soft' or 'straight_through'"),
+        ({"config": None}, "give a FilterConfig with smoothing"),
+        ({"scenarios": {}}, "give at least one scene"),
+        ({"scenarios": [tiny_runs.scenario()]}, "at least one scene by its name"),
+        ({"scenarios": SCENES | {"long": tiny_runs.scenario(num_frames=13)}}, "differ in more than numbers"),
+        ({"parameters": {}}, "at least one path with its interval"),
+        ({"parameters": {"config.gate.th3": Interval(0, 1)}}, "no numeric leaf 'config.gate.th3'; choose among: "),
+        ({"parameters": {TH1: (1, 2)}}, "give an Interval"),
+        ({"parameters": {F: Interval(0.5, 5.5)}}, r"high=5.5\): f is below half the frame rate, 5 Hz"),
+        ({"parameters": {A: Interval(0.0, 3.0)}}, r"from 0 to 3: A is a swing of the camera, between 0 and 0.5 m"),
+    ):
+        given = {"scenarios": SCENES, "config": SOFT, "parameters": PARAMETERS} | arguments
+        with pytest.raises(ValueError, match=message):
+            problem_of(**given)
+    for make, message in (
+        (lambda: Interval(2.0, 1.0), "above low=2"),
+        (lambda: Interval(0.0, 1.0, is_log=True), "logarithmic scale needs a positive number"),
+        (lambda: Schedule(pairs_per_step=0), "pairs_per_step=0"),
+        (lambda: Schedule(spread=0.0), r"spread=0.0\).*positive"),
+        (lambda: Schedule(temperature_end=0.0), r"temperature_end=0.0\).*positive"),
+        (
+            lambda: PROBLEM.to_free(START | {TH1: 60.0}),
+            r"config.gate.th1: Interval\(0.2, 50\): 60 is not inside; widen",
+        ),
+        (lambda: descend(PROBLEM, START, ONE_STEP, key=0), r"key=0\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+
+
+def test_the_numbers_of_the_paper_are_inside():
+    assert all(np.isfinite(interval.to_free(9.0)) for interval in THRESHOLDS.values())
+    assert np.isfinite(OSCILLATION[A].to_free(0.05)) and np.isfinite(OSCILLATION[F].to_free(3.0))
+    assert vc.VirtualCorrection().th1 == vc.VirtualCorrection().th2 == 9.0
