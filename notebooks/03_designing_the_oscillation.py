@@ -293,8 +293,10 @@ assert after["parameters"][A] > 0.07
 assert compared["paired"][ALL]["detection_f1"]["lower"] > 0 and compared["paired"][ALL]["loss"]["upper"] < 0
 
 # %% [markdown]
-# The swing becomes wider, and detection better by more than its interval, on seeds that nothing was tuned on. What it
-# costs is the speed of the camera, which the objective weighs: a wider swing pays for itself by being slower.
+# The swing becomes wider, and detection better by more than its interval, on seeds that nothing was tuned on. It is paid
+# for by the camera, which moves faster: 0.02 per m²/s² is a small price, and `--camera-motion` or the weight in
+# `Objective` sets another. The frequency is not well determined: over most of the band the mean above is flat within its
+# errors, so where f ends depends on the seeds and on the price of motion.
 #
 # All of this assumes that the filter knows the swing exactly. `FilterConfig(oscillation_std_m=...)` tells it otherwise.
 #
