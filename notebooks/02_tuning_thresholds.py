@@ -38,6 +38,7 @@ jax.config.update("jax_num_cpu_devices", os.cpu_count())  # runs are shared betw
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.display import display
 from jax.tree_util import Partial
 
 import vcjax as vc
@@ -126,13 +127,13 @@ for temperature, loss in of_soft.items():
     apart = np.abs(loss - of_hard).mean()
     print(f"soft, {temperature:4g} ", loss.round(3), f"{apart:.3f} from the hard one in the mean")
 # %% [markdown]
-# All have their minimum at the same threshold, 12. The colder, the nearer to the hard filter; the hottest sees
-# the left slope too high, since at 2 units of temperature even a static feature is called dynamic to some degree in
-# many frames.
+# All have their minimum at the same one of these thresholds, 12. The colder, the nearer to the hard filter; the hottest
+# sees the left slope too high, since at 2 units of temperature even a static feature is called dynamic to some degree
+# in many frames.
 #
-# A single seed is rough, and the soft filter is as well: which features are chosen, born and deleted stays a
-# hard decision, so one flip makes another run. The derivative of one run is true and yet of little use. What is made
-# small is therefore a mean, over scenes, over seeds that are new in every step, and over a neighbourhood of the
+# A single seed is rough, with soft decisions no less than with hard ones: which features are chosen, born and deleted
+# stays a hard decision, so one flip makes another run. The derivative of one run is true and yet of little use. What is
+# made small is therefore a mean, over scenes, over seeds that are new in every step, and over a neighbourhood of the
 # thresholds (see `vcjax/study/descent.py`), while τ falls from 2 to 0.5.
 
 # %%
@@ -142,8 +143,8 @@ assert np.abs(of_soft[0.25] - of_hard).mean() < np.abs(of_soft[2.0] - of_hard).m
 # %% [markdown]
 # ## 2. The landscape
 #
-# Now over both thresholds and with hard decisions: a grid of 7 × 7, two seeds in each of the two scenes at every point.
-# `search` runs it, takes the best point, and compares that with the thresholds before on other seeds.
+# Now over both thresholds and with hard decisions: a grid of 7 × 7, three seeds in each of the two scenes at every
+# point. `search` runs it. (It also takes the best point, and compares that with the thresholds before on other seeds.)
 
 # %%
 START = {TH1: 5.99, TH2: 5.99}
@@ -153,12 +154,12 @@ found = search(
     soft_filter,  # `search` and all that compares settings decide hard, whatever the filter says
     {TH1: coarse, TH2: coarse},
     objective=objective,
-    seeds=Seeds(choosing=2, held_out=1),
+    seeds=Seeds(choosing=3, held_out=1),
     key=jax.random.key(0),
 )
 grid = as_grid(found)
 mean = grid[["loss", "position_rmse_cm", "static_deleted_per_run"]].mean(("scene", "seed"))
-landscape_figure(grid, "Hard decisions, means over 2 scenes × 2 runs at every point")
+landscape_figure(grid, "Hard decisions, means over 2 scenes × 3 runs at every point")
 # %% [markdown]
 # The objective's valley is an L: the larger of the two thresholds decides, and it should be about 12. The closed
 # form says why. With λ the variance of the innovation over that of the pixel noise, and an innovation along one of its
@@ -176,14 +177,14 @@ landscape_figure(grid, "Hard decisions, means over 2 scenes × 2 runs at every p
 
 # %%
 larger = np.maximum(*np.meshgrid(coarse, coarse, indexing="ij"))
-loss, static_deleted = mean.loss.values, mean.static_deleted_per_run.values
-is_valley = np.isclose(larger, 12.0)
-print(f"objective in the valley, max(Th₁, Th₂) = 12: median {np.median(loss[is_valley]):.2f}")
-print(f"max(Th₁, Th₂) below 5: at least {loss[larger < 5].min():.2f}; above 30: at least {loss[larger > 30].min():.2f}")
-print(f"static features deleted per run: {static_deleted[larger < 5].min():.1f} and more where it is below 5,")
-print(f"{static_deleted[larger > 15].max():.1f} and less where it is above 15")
-assert np.median(loss[is_valley]) < min(loss[larger < 5].min(), loss[larger > 30].min())
-assert static_deleted[larger < 5].min() > 10 > 3 > static_deleted[larger > 15].max()
+by_larger = {value: mean.where(larger == value).mean() for value in coarse}
+for value, averaged in by_larger.items():
+    loss, deleted = float(averaged.loss), float(averaged.static_deleted_per_run)
+    print(f"max(Th₁, Th₂) = {value:4.1f}: objective {loss:.2f}, {deleted:4.1f} static features deleted per run")
+loss, deleted = (np.array([float(v[name]) for v in by_larger.values()]) for name in ("loss", "static_deleted_per_run"))
+assert 12 <= round(coarse[np.argmin(loss)]) <= 19
+assert loss[3] < min(*loss[:2], *loss[5:]) - 0.1
+assert deleted[:2].min() > 10 > 1 > deleted[4:].max()
 
 # %% [markdown]
 # ## 3. Down by gradient
@@ -192,6 +193,7 @@ assert static_deleted[larger < 5].min() > 10 > 3 > static_deleted[larger > 15].m
 # for two. `tune` goes down by Adam. It starts where a textbook would: at 5.99, which 95 % of the squared distances of
 # a fitting measurement stay below. Each of the eight steps averages two pairs of runs in each scene, 64 runs in all;
 # then the end is compared with the start, first to choose between the two, and then on seeds that nothing has seen.
+# The learning rate is half the default: in so few steps Adam's momentum carries far.
 
 # %%
 tuned = tune(
@@ -199,7 +201,7 @@ tuned = tune(
     soft_filter,
     THRESHOLDS,
     objective=objective,
-    schedule=Schedule(num_steps=8, pairs_per_step=2),
+    schedule=Schedule(num_steps=8, pairs_per_step=2, learning_rate=0.15),
     seeds=Seeds(choosing=4, held_out=20),
     key=jax.random.key(0),
 )
@@ -212,7 +214,7 @@ for number, step in enumerate(descent, start=1):
 end = end_of(problem_of(scenarios, soft_filter, THRESHOLDS, objective), descent)
 print(f"end, a mean over the last steps: Th₁ {end[TH1]:.1f}, Th₂ {end[TH2]:.1f}")
 assert tuned.num_runs == 64 and tuned.num_failed == 0
-assert tuned.choice.after == end and 9 < max(end.values()) < 20
+assert tuned.choice.after == end and 9 < max(end.values()) < 17
 
 # %%
 landscape_figure(
@@ -224,7 +226,7 @@ landscape_figure(
 # %% [markdown]
 # The path goes straight out of the region where static features are deleted and stops in the valley, at its corner
 # since both thresholds started alike. From another start it ends on an arm; `num_starts` tries several and keeps the
-# best. With so few runs in a step, the last steps wander; where they end on the valley's flat ground says little.
+# best. With so few runs in a step, where it ends on the valley's flat ground says little.
 #
 # ## 4. Is it better?
 #
@@ -240,15 +242,19 @@ for name in ("loss", "detection_f1", "dynamic_found_per_run", "static_deleted_pe
     low, high = difference[name]["lower"], difference[name]["upper"]
     print(f"{name:23} {before[name]['mean']:6.2f} → {after[name]['mean']:6.2f}   difference [{low:+.2f}, {high:+.2f}]")
 assert difference["loss"]["upper"] < -0.1 and difference["detection_f1"]["lower"] > 0.1
-assert difference["static_deleted_per_run"]["upper"] < -5
+assert difference["static_deleted_per_run"]["upper"] < -5 and difference["position_rmse_cm"]["lower"] > 0
 
 # %%
-curves_figure(tuned.choice)
+curves = curves_figure(tuned.choice)
+curves.axes[1].set_ylabel("precision")
+display(curves)
 # %% [markdown]
-# F1 rises and the objective falls, both by more than their intervals, because some ten static features fewer are
-# deleted in a run. The curves rank all tracks by the largest margin each ever had, at every threshold on it: they
-# say how well the two filters separate movers from static features, wherever the line between them is drawn, and the
-# dotted one marks 1 % of the static features.
+# F1 rises and the objective falls, both by more than their intervals, because more than five static features fewer are
+# deleted in a run. The position error rises: the objective's 2/m says that F1 is worth it, another weight may say no.
+#
+# The curves rank all tracks by the largest margin each ever had, at every threshold on it. They say how well the two
+# filters separate movers from static features, wherever the line between them is drawn; the dotted line marks 1 % of
+# the static features.
 #
 # The defaults of this package, Th₁ = Th₂ = 9, lie at the foot of the inner slope already. Between them and the
 # valley's floor the gain is small, and 20 seeds in two scenes need not show it.

@@ -48,6 +48,7 @@ from vcjax.report.comparison import comparison
 from vcjax.report.descent import descent_figure
 from vcjax.study.choice import ALL, Seeds
 from vcjax.study.descent import Schedule
+from vcjax.study.evaluate import evaluate
 from vcjax.study.intervals import OSCILLATION
 from vcjax.study.losses import Objective
 from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
@@ -108,31 +109,44 @@ assert beta == 1 and focal_px == 320 and apart_px < 1e-9
 # without noise, the best static point leaves nearly as much.
 
 # %%
-oscillation = Oscillation(amplitude_m=0.05, frequency_hz=3.0)
-swing = np.asarray(oscillate(oscillation, jnp.asarray(time_s)))
+
+
+def displacement_m(amplitude_m, frequency_hz):
+    """s at the times of the frames."""
+    return np.asarray(oscillate(Oscillation(amplitude_m, frequency_hz), jnp.asarray(time_s)))
+
+
+swing = displacement_m(0.05, 3.0)
 swinging = steady + swing[:, None] * RIGHT
 distance_m = (mover - swinging)[:, 2]
 residual_px = pixels(twin, swinging) - pixels(mover, swinging)
 predicted_px = -focal_px * beta * swing / distance_m
-fitted = least_squares(lambda p: (pixels(p, swinging) - pixels(mover, swinging)).ravel(), start / (1 + beta))
-fitted_px = pixels(fitted.x, swinging) - pixels(mover, swinging)
+
+
+def left_over_px(point_m, camera_m):
+    """A static point's pixels minus the mover's."""
+    return (pixels(point_m, camera_m) - pixels(mover, camera_m)).ravel()
+
+
+fitted = least_squares(left_over_px, start / (1 + beta), args=(swinging,))
 
 figure, axes = plt.subplots(figsize=(7.5, 3.4), layout="constrained")
 envelope = focal_px * beta * 0.05 / distance_m
-axes.fill_between(distance_m, -envelope, envelope, color="0.92", label="± f_px A β/d")
+axes.fill_between(distance_m, -envelope, envelope, color="0.92", label=r"$\pm f_{px} A \beta / d$")
 axes.plot(distance_m, predicted_px, color="#0072b2", linewidth=0.8, label="formula")
 axes.plot(distance_m, residual_px[:, 0], ".", color="#d55e00", markersize=4, label="projected pixels")
 axes.set(xlabel="distance d of the mover, m", ylabel="static twin − mover, px", xlim=(12, 2))
 _ = figure.legend(loc="outside right upper", frameon=False)
 
-relative = np.sqrt(np.mean(fitted_px**2) / np.mean(residual_px**2))
+relative = np.sqrt(np.mean(fitted.fun**2) / np.mean(residual_px**2))
 print(f"formula against projected pixels: at most {np.abs(predicted_px - residual_px[:, 0]).max():.0e} px apart")
 print(f"best static point: {relative:.0%} of the residual of the twin, RMS")
 assert np.abs(predicted_px - residual_px[:, 0]).max() < 1e-9 and np.abs(residual_px[:, 1]).max() < 1e-9
 assert 0.8 < relative <= 1 and np.isclose(focal_px * 0.05, 16)
+assert round(16 / 12, 1) == 1.3 and round(16 / 3, 1) == 5.3
 # %% [markdown]
-# The noise of a pixel is 1 px here. At 12 m the residual, 1.3 px, is lost in it; at 4 m it is 4 px, and only then can
-# the distance of a single measurement, RE₁ > 9, tell.
+# The noise of a pixel is 1 px here. At 12 m the residual of 1.3 px is lost in it. A gate with Th₁ = 9 isolates from
+# 3 px on at the earliest, where the map is exact: the residual is as large as that when the mover has come to 5.3 m.
 #
 # ## 3. What the filter finds
 #
@@ -160,7 +174,6 @@ is_seen = np.asarray(recording.is_valid)[:, is_moving]
 nearest_m = np.where(is_seen, ahead_m, np.inf).min(axis=0)
 largest_px = focal_px * beta * np.array(amplitudes_m)[:, None] / nearest_m
 first_deleted = runs.first_deleted.values[:, :, is_moving]  # (amplitude, seed, mover), 0 where never
-found_share = (first_deleted > 0).mean(axis=1)
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.6), layout="constrained")
 found = (first_deleted > 0).sum(axis=2)
@@ -174,7 +187,9 @@ for amplitude_m, first in zip(amplitudes_m, first_deleted, strict=True):
     right.plot(np.full(len(at_m), amplitude_m), at_m, ".", color="#d55e00", alpha=0.5)
 line = np.linspace(1e-3, 0.13, 200)
 for px, style in ((3, "-"), (8, "--")):
-    right.plot(line, focal_px * beta * line / px, style, color="0.4", linewidth=1, label=f"f_px A β/d = {px} px")
+    right.plot(
+        line, focal_px * beta * line / px, style, color="0.4", linewidth=1, label=rf"$f_{{px}} A \beta / d$ = {px} px"
+    )
 right.set(xlabel="amplitude A, m", ylabel="distance where found, m", ylim=(0, 12), xlim=(-0.005, 0.13))
 right.set_title("each mover found")
 _ = right.legend(frameon=False, loc="upper left")
@@ -182,46 +197,59 @@ print("largest residual of each mover while in view, px, by amplitude:")
 for amplitude_m, row in zip(amplitudes_m, largest_px, strict=True):
     print(f"  A = {amplitude_m:.2f} m: {np.sort(row).round(1)}")
 # %% [markdown]
-# The steady camera finds next to nothing, and from 5 cm on nearly all six are found. A wider swing finds them earlier,
-# while they are farther away: the points on the right follow a line of constant residual, three to eight pixels, which
-# is several times the noise. That is the formula's use: it says from a drawing how far one must swing to find what at
-# which distance, before anything is simulated.
+# With 1 cm the four movers beside the path never show more than 2 px before they leave the image, and the filter finds
+# next to none; with 2 cm they reach 3 px, and it finds about half; from 5 cm on it finds nearly all. Most are found
+# where the residual is 3 to 8 px, so the formula gives the scale. But the distance where they are found grows by less
+# than the amplitude: a mover that shows early has been seen for as long all the same, and what is mapped well at its
+# twin's place is recovered even where it fits badly (see [02_tuning_thresholds](02_tuning_thresholds.py)).
 
 # %%
-found_mean = found.mean(axis=1)
-assert found_mean[0] < 1 < 4 < found_mean[amplitudes_m.index(0.05)]
-at_amplitude = dict(zip(amplitudes_m, peaks_px, strict=True))
-for amplitude_m in (0.05, 0.08, 0.12):
-    low, middle, high = np.percentile(at_amplitude[amplitude_m], [10, 50, 90])
-    print(f"A = {amplitude_m:.2f} m: residual where found, median {middle:.1f} px, 80 % in {low:.1f} to {high:.1f} px")
-    assert 2 < middle < 12
+positions_cm = summary.position_rmse_cm.sel(statistic="mean").values
+mean_found = dict(zip(amplitudes_m, found.mean(axis=1), strict=True))
+peak_px = np.concatenate(peaks_px[2:])
+print(f"residual where found, A from 2 cm: 10, 50, 90 % quantile {np.percentile(peak_px, [10, 50, 90]).round(1)} px")
+assert np.sort(largest_px[1])[:4].max() < 2 and np.sort(largest_px[2])[:4].min() > 2.9
+assert mean_found[0.0] < 1 and mean_found[0.01] < 1 and 2 < mean_found[0.02] < 4
+assert min(mean_found[a] for a in (0.05, 0.08, 0.12)) > 5
+assert np.mean((peak_px > 3) & (peak_px < 8)) > 0.6 and positions_cm[0] < positions_cm[4] > 2 * positions_cm[-1]
 
 # %% [markdown]
-# Finding is not all. In the summary above the position error first rises with the swing and falls again: a swing of a
-# few centimetres finds movers late, after they have bent the path, and every one that is deleted is born anew. At 12 cm
-# they are found before they do harm.
+# The position error rises at first, by movers that are found late or recovered, and falls again: with 12 cm it is less
+# than half of what it is with 5 cm.
 #
 # ## 4. The frequency
 #
-# At 10 frames per second the camera is where A sin(2πfk/10) puts it in frame k. So f and 10 − f give the same path up
-# to its sign, and 0, 5 and 10 Hz give none: every frame falls on a zero of the sine. All that can be had lies between 0
-# and 5 Hz.
+# The camera takes pictures at times k/10 s. There sin(2π(10 − f)k/10) = −sin(2πf k/10): 10 − f gives the same
+# displacements as f with the sides exchanged, and 5 Hz, like 0, gives none at all. So a scenario takes frequencies
+# below half of the frame rate. The size of the residual does not depend on f. But the formula holds map and path fixed,
+# and what changes slowly the filter can follow with both. So f should not matter as long as it is high enough, and that
+# is what is found: nothing much changes between 1 and 4.5 Hz. At 0.1 Hz, one and a half swings in a run, the movers hide
+# again; and 4.9 Hz, which the frames see as a swing from side to side that comes and goes every five seconds, finds
+# fewer than 4.5 Hz.
 
 # %%
-frames_s = np.arange(160) / 10.0
-swing_of = {f: np.asarray(oscillate(Oscillation(0.05, f), jnp.asarray(frames_s))) for f in (3.0, 7.0, 0.0, 5.0, 10.0)}
-print(f"3 Hz + 7 Hz: at most {np.abs(swing_of[3.0] + swing_of[7.0]).max():.0e} m")
-print(f"5 Hz: at most {np.abs(swing_of[5.0]).max():.0e} m")
-assert np.abs(swing_of[3.0] + swing_of[7.0]).max() < 1e-12
-assert max(np.abs(swing_of[f]).max() for f in (0.0, 5.0, 10.0)) < 1e-12
+for frequency_hz in (0.5, 2.0, 3.7):
+    mirrored = displacement_m(0.05, 10.0 - frequency_hz)
+    assert np.allclose(displacement_m(0.05, frequency_hz), -mirrored, atol=1e-12)
+assert max(np.abs(displacement_m(0.05, f)).max() for f in (0.0, 5.0)) < 1e-12
+
+frequencies_hz = [0.1, 0.5, 1.0, 2.0, 3.0, 4.0, 4.5, 4.9]
+runs = vc.monte_carlo(scenario, config, num_seeds=4, key=jax.random.key(0), sweep={F: frequencies_hz})
+by_frequency = vc.summarise(runs)
+found_at = by_frequency.dynamic_found_per_run.sel(statistic="mean").values
+for frequency_hz, number in zip(frequencies_hz, found_at, strict=True):
+    print(f"f = {frequency_hz:.1f} Hz: {number:.2f} of 6 movers found")
+assert found_at[0] < 3 and found_at[2:7].min() > 4
 
 # %% [markdown]
-# A derivative by f is another matter. After 16 s the phase 2πft has turned by 16 cycles for every hertz, so a
-# hundredth of a hertz shifts the last frames by a sixth of a cycle: other pixels, another choice of what is corrected,
-# another run. The objective of one seed (soft decisions) against f, and the mean of many:
+# **Why the gradient by f is hard.** At the end of the run's 16 s the phase is 2πf·16: another 0.06 Hz is another full
+# turn. So a change of f far too small to matter for anything else puts the camera elsewhere in every late frame, other
+# features are chosen, other movers found. Here is the objective of a soft filter for one seed, over one hertz in steps
+# of a fortieth, and closer, in steps of a thousandth; on the right the same run's objective over A.
 
 # %%
 objective = Objective(track_f1=1.0, position=2.0, camera_motion=0.02)
+soft_filter = vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")
 
 
 def one_run(experiment, values, key):
@@ -231,76 +259,127 @@ def one_run(experiment, values, key):
     return {"loss": objective(experiment.scenario, info, truth)}
 
 
-work = Partial(one_run, Experiment(scenario, vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")))
-fine_hz = np.linspace(2.8, 3.2, 81)
-fine = run_lanes(work, {F: fine_hz}, np.zeros(81, int), jax.random.key(0))["loss"]
-coarse_hz = np.linspace(0.75, 4.5, 6)
-lanes = {F: np.repeat(coarse_hz, 16)}
-coarse = run_lanes(work, lanes, np.tile(np.arange(16), 6), jax.random.key(0))["loss"].reshape(6, 16)
+wide_hz, near_hz = np.linspace(2.5, 3.5, 41), np.linspace(2.985, 3.015, 31)
+swept_m = np.linspace(0.02, 0.12, 26)
+at_f = np.concatenate([wide_hz, near_hz, np.full(len(swept_m), 3.0)])
+at_a = np.concatenate([np.full(len(wide_hz) + len(near_hz), 0.05), swept_m])
+lanes = run_lanes(
+    Partial(one_run, Experiment(scenario, soft_filter)),
+    {A: at_a, F: at_f},
+    np.zeros(len(at_f), int),
+    jax.random.key(0),
+)
+over_wide, over_near, over_a = np.split(lanes["loss"], [len(wide_hz), len(wide_hz) + len(near_hz)])
 
-figure, (left, right) = plt.subplots(1, 2, figsize=(9.5, 3.4), layout="constrained", sharey=True)
-left.plot(fine_hz, fine, ".-", color="#0072b2", linewidth=0.8, markersize=3)
-left.set(xlabel="f, Hz", ylabel="objective", title="one seed, every 0.005 Hz")
-right.errorbar(coarse_hz, coarse.mean(axis=1), coarse.std(axis=1, ddof=1) / 4, fmt="o-", color="black")
-right.set(xlabel="f, Hz", title="mean of 16 seeds, ± one standard error")
+figure, panels = plt.subplots(1, 3, figsize=(10.5, 3.3), layout="constrained", sharey=True)
+for axes, x, y, label in (
+    (panels[0], wide_hz, over_wide, "f, Hz (A = 0.05 m)"),
+    (panels[1], near_hz, over_near, "f, Hz, closer"),
+    (panels[2], swept_m, over_a, "A, m (f = 3 Hz)"),
+):
+    axes.plot(x, y, ".-", color="#0072b2", linewidth=0.8, markersize=4)
+    axes.set_xlabel(label)
+panels[0].axvspan(near_hz[0], near_hz[-1], color="0.9")
+_ = panels[0].set_ylabel("objective of one seed, τ = 1")
 
-ripple = np.std(np.diff(fine)) / np.sqrt(2)
-slope = np.abs(np.diff(fine)).mean() / (fine_hz[1] - fine_hz[0])
-print(f"one seed scatters by {ripple:.2f} from one point to the next, a slope of {slope:.0f} per hertz;")
-print(f"the mean falls from {coarse.mean(axis=1).max():.2f} to {coarse.mean(axis=1).min():.2f} over the whole band")
-assert slope > 3
-
+slopes = np.diff(over_near) / np.diff(near_hz)
+trend = np.polyfit(wide_hz, over_wide, 1)[0]
+print(f"slope over one hertz {trend:+.2f} per Hz; between neighbours 0.001 Hz apart {np.abs(slopes).mean():.0f}")
 # %% [markdown]
-# The slope of one run is true, and says nothing about where the mean goes. The descent therefore makes small the mean
-# over a neighbourhood, and estimates its gradient in two ways from the same pair of runs, at x + ε and x − ε: by the
-# derivatives along both, and by the difference of the two objectives. Each parameter takes their mean, weighted by how
-# little they scatter. For thresholds and amplitude that is mostly the derivative; for the frequency it is the pair.
+# The derivative at a point is true, and it is that of a ripple. `descent` makes the mean over a neighbourhood small
+# instead, E[L(x + ε)] with ε normal, whose gradient has two unbiased estimates: the mean of the derivatives at x ± ε,
+# and the difference of the two losses, (L(x + ε) − L(x − ε)) ε/2σ², which sees only what is left of a ripple at some
+# distance. Each step makes pairs of runs, has both estimates, and weighs them for each parameter by the inverse of
+# their variances.
 #
-# ## 5. A and f by gradient
+# ## 5. What a gradient chooses
 #
-# The objective asks for movers to be found and static features spared (1 − F1), for the position (2/m), and for as
-# little camera motion as that needs: 0.02 times its mean square speed (2πfA)²/2 in m²/s². Two scenes, two pairs of
-# runs of each in a step.
+# The same objective as for the thresholds, with a price of motion: 1 − F1, 2/m times the position error, and 0.02 s²/m²
+# times `camera_motion_m2_s2`, the mean square speed (2πfA)²/2 of the camera on its slide. Movers come towards the robot
+# at 0.5 and at 0.25 m/s. Eight steps of three pairs in each scene, 96 runs, from the paper's A = 0.05 m, f = 3 Hz; then
+# 20 seeds held out for each scene, hard decisions.
 
 # %%
+assert np.abs(slopes).mean() > 5 * abs(trend)
 tuned = tune(
     scenarios,
-    vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft"),
+    soft_filter,
     OSCILLATION,
     objective=objective,
-    schedule=Schedule(num_steps=8, pairs_per_step=2),
-    seeds=Seeds(choosing=4, held_out=16),
+    schedule=Schedule(num_steps=8, pairs_per_step=3),
+    seeds=Seeds(choosing=6, held_out=20),
     key=jax.random.key(1),
 )
+(descent,) = tuned.descents
+for number, step in enumerate(descent, start=1):
+    print(
+        f"step {number}: A {step.parameters[A]:.3f} m, f {step.parameters[F]:.2f} Hz, smoothed objective "
+        f"{step.loss:.2f} ± {step.loss_se:.2f}; weight of the derivative: by A {step.pathwise[A]:.2f}, "
+        f"by f {step.pathwise[F]:.3f}"
+    )
+weight_a, weight_f = (np.mean([step.pathwise[path] for step in descent]) for path in (A, F))
+assert tuned.num_runs == 96 and tuned.num_failed == 0
+assert weight_f < 0.05 < 0.3 < weight_a
 descent_figure(tuned.descents)
+# %% [markdown]
+# By A the derivatives have a large weight in most steps, and A goes up steadily. By f they have next to none: the pairs
+# take over. Where f goes is a matter of few runs, and of the price.
 
 # %%
-weights = {path: np.mean([step.pathwise[path] for step in tuned.descents[0]]) for path in OSCILLATION}
-print(f"weight of the derivative along the run: {weights[A]:.2f} for A, {weights[F]:.3f} for f")
-assert weights[A] > 0.3 and weights[F] < 0.1
-
+before, after = tuned.choice.before, tuned.choice.after
 compared = comparison(tuned.choice)
-before, after = (compared[side] for side in ("before", "after"))
-print(f"A {before['parameters'][A]:.3f} → {after['parameters'][A]:.3f} m")
-print(f"f {before['parameters'][F]:.2f} → {after['parameters'][F]:.2f} Hz")
-for name in ("detection_f1", "dynamic_found_per_run", "static_deleted_per_run", "position_rmse_cm", "loss"):
-    means = [side["metrics"][ALL][name]["mean"] for side in (before, after)]
-    low, high = (compared["paired"][ALL][name][end] for end in ("lower", "upper"))
-    print(f"{name:23} {means[0]:6.2f} → {means[1]:6.2f}   difference [{low:+.2f}, {high:+.2f}]")
-speed = [np.sqrt(0.5) * 2 * np.pi * side["parameters"][A] * side["parameters"][F] for side in (before, after)]
-print(f"camera, RMS speed      {speed[0]:6.2f} → {speed[1]:6.2f} m/s")
-assert after["parameters"][A] > 0.07
-assert compared["paired"][ALL]["detection_f1"]["lower"] > 0 and compared["paired"][ALL]["loss"]["upper"] < 0
+metrics = [compared[side]["metrics"][ALL] for side in ("before", "after")]
+print(f"A {before[A]:.3f} → {after[A]:.3f} m, f {before[F]:.2f} → {after[F]:.2f} Hz")
+for name in ("loss", "detection_f1", "dynamic_found_per_run", "static_deleted_per_run", "position_rmse_cm"):
+    difference = compared["paired"][ALL][name]
+    print(
+        f"{name:23} {metrics[0][name]['mean']:6.2f} → {metrics[1][name]['mean']:6.2f}   "
+        f"difference [{difference['lower']:+.2f}, {difference['upper']:+.2f}]"
+    )
+motion = [0.5 * (2 * np.pi * setting[F] * setting[A]) ** 2 for setting in (before, after)]
+print(f"camera motion           {motion[0]:6.2f} → {motion[1]:6.2f} m²/s²")
+paired = compared["paired"][ALL]
+assert after[A] > 0.07 and paired["loss"]["upper"] < -0.05
+assert paired["dynamic_found_per_run"]["lower"] > 0.5 and paired["position_rmse_cm"]["upper"] < 0
+assert paired["static_deleted_per_run"]["mean"] < 1 and motion[1] > motion[0]
+assert round(0.02 * motion[0], 3) == 0.009
 
 # %% [markdown]
-# The swing becomes wider, and detection better by more than its interval, on seeds that nothing was tuned on. It is paid
-# for by the camera, which moves faster: 0.02 per m²/s² is a small price, and `--camera-motion` or the weight in
-# `Objective` sets another. The frequency is not well determined: over most of the band the mean above is flat within its
-# errors, so where f ends depends on the seeds and on the price of motion.
+# More movers are found and the position error falls, both by more than their intervals, and hardly a static feature is
+# paid for it. The price is motion, and more of it. That is a choice of the objective, whose weight makes the
+# paper's oscillation cost no more than 0.009 of F1.
 #
-# All of this assumes that the filter knows the swing exactly. `FilterConfig(oscillation_std_m=...)` tells it otherwise.
+# But the price grows with A·f, and what is seen with A alone. So the same motion as before can be had with the tuned
+# amplitude and a lower frequency:
+
+# %%
+equal_price_hz = before[A] * before[F] / after[A]
+runs = evaluate(
+    scenarios,
+    config,
+    {A: [before[A], after[A], after[A]], F: [before[F], after[F], equal_price_hz]},
+    objective=objective,
+    num_seeds=12,
+    key=jax.random.key(2),
+)
+figures = runs[["loss", "dynamic_found_per_run", "position_rmse_cm"]].mean(("scene", "seed"))
+for i, name in enumerate(("before", "tuned", "tuned A, motion as before")):
+    amplitude_m, frequency_hz = float(runs[A][i]), float(runs[F][i])
+    print(
+        f"{name:26} A {amplitude_m:.3f} m, f {frequency_hz:.2f} Hz, "
+        f"{0.5 * (2 * np.pi * amplitude_m * frequency_hz) ** 2:.2f} m²/s²: "
+        f"{float(figures.dynamic_found_per_run[i]):.2f} movers found, {float(figures.position_rmse_cm[i]):.1f} cm, "
+        f"objective {float(figures.loss[i]):.2f}"
+    )
+assert figures.loss[2] < figures.loss[0] - 0.05
+assert figures.dynamic_found_per_run[2] > figures.dynamic_found_per_run[0] + 0.3
+
+# %% [markdown]
+# That a swing of 5 cm at 3 Hz is bettered by a slower and wider one holds for these two scenes and this objective; how
+# far a camera can swing, and how a blurred image measures, is not part of the model.
 #
 # ## Next
 #
-# - `scripts/tune_oscillation.py` does this in a script to copy; `vcjax tune oscillation` and `vcjax tune joint` as
-#   commands, for all six scenes, with 100 seeds held out. `docs/tuning.md` has what came out.
+# - `scripts/tune_oscillation.py` does this for three speeds, in a script to copy; `vcjax tune oscillation` as a
+#   command, and `vcjax tune joint` tunes the thresholds with it.
+# - `scripts/oscillation_amplitude.py` sweeps A for both gates.

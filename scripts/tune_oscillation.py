@@ -61,7 +61,7 @@ def main(study: Study) -> None:
         vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft"),
         {
             "scenario.oscillation.amplitude_m": Interval(0.0, study.max_amplitude_m),
-            "scenario.oscillation.frequency_hz": Interval(*study.frequency_band_hz),
+            "scenario.oscillation.frequency_hz": Interval(*study.frequency_band_hz, spread=0.4),
         },
         objective=Objective(track_f1=1.0, camera_motion=study.motion_weight),
         schedule=Schedule(num_steps=study.steps, pairs_per_step=study.pairs),

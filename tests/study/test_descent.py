@@ -44,12 +44,12 @@ def test_intervals_map_every_number_inside_and_back(low, factor, is_log, free):
 def test_a_step_averages_both_estimates_over_the_pairs_and_goes_down():
     """Against runs made one by one here: the loss at x ± ε, its finite differences, and the weights of the two."""
     (step,) = descend(PROBLEM, START, ONE_STEP, key=KEY)
-    free, sigma, h = PROBLEM.to_free(START), ONE_STEP.spread, 1e-5
+    free, sigma, h = PROBLEM.to_free(START), np.array([0.05, 0.05, 0.4]), 1e-5
 
     def loss(number, seed, free):
         lane = {"scene": jnp.asarray(number), "sign": jnp.asarray(1.0)}
         key = jax.random.fold_in(jax.random.fold_in(KEY, 0), seed)
-        return float(plain(PROBLEM, free, jnp.asarray(0.0), jnp.asarray(ONE_STEP.temperature(0)), lane, key)["loss"])
+        return float(plain(PROBLEM, free, jnp.zeros(3), jnp.asarray(ONE_STEP.temperature(0)), lane, key)["loss"])
 
     plain = jax.jit(module._value_and_gradient)
     losses, pathwise, of_pairs = [], [], []
@@ -150,7 +150,7 @@ def test_bad_problems_are_refused(unchecked):
         (lambda: Interval(2.0, 1.0), "above low=2"),
         (lambda: Interval(0.0, 1.0, is_log=True), "logarithmic scale needs a positive number"),
         (lambda: Schedule(pairs_per_step=0), "pairs_per_step=0"),
-        (lambda: Schedule(spread=0.0), r"spread=0.0\).*positive"),
+        (lambda: Interval(1.0, 2.0, spread=0.0), r"spread=0.0\).*positive"),
         (lambda: Schedule(temperature_end=0.0), r"temperature_end=0.0\).*positive"),
         (
             lambda: PROBLEM.to_free(START | {TH1: 60.0}),

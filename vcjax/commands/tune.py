@@ -73,7 +73,7 @@ class Tune:
             raise ValueError(f"--landscape-points {self.landscape_points}: give at least 2, or 0 for no landscape.")
         oscillation = {
             "scenario.oscillation.amplitude_m": Interval(0.0, self.max_amplitude_m),
-            "scenario.oscillation.frequency_hz": Interval(*self.frequency_band_hz),
+            "scenario.oscillation.frequency_hz": Interval(*self.frequency_band_hz, spread=0.4),
         }
         pairs = {"thresholds": THRESHOLDS, "oscillation": oscillation}
         chosen = pairs if self.what == "joint" else {self.what: pairs[self.what]}

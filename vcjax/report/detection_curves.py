@@ -26,8 +26,8 @@ def curves_figure(choice: Choice) -> Figure:
         _draw(left, roc.FALSE_RATES, roc.recall_at, tracks[ALL], side, style)
         _draw(right, roc.RECALLS, roc.precision_at, tracks[ALL], side, style)
     _roc_axes(left)
-    right.set_xlabel("recall: share of the movers found")
-    right.set_ylabel("precision: movers among those called dynamic")
+    right.set_xlabel("recall: movers found")
+    right.set_ylabel("precision")
     right.set_xlim(0, 1)
     right.set_ylim(0, 1.02)
     seeds, scenes = choice.held_out.sizes["seed"], choice.held_out.sizes["scene"]

@@ -6,7 +6,8 @@ temperature of the smoothing falls from step to step.
 
 The derivative of one long run need not say where the mean of many goes: a run's phase of oscillation depends on f times
 its whole length, and its loss ripples with f over less than a tenth of a hertz, steeply. So what is made small is the
-mean over a neighbourhood, E[L(x + ε)] with ε ~ N(0, σ² I), whose gradient has two unbiased estimates:
+mean over a neighbourhood, E[L(x + ε)] with ε ~ N(0, diag σ²) and a σ for each parameter. Its gradient has two unbiased
+estimates:
 
     pathwise        ∂L/∂x at x ± ε, in forward mode           sharp where runs change smoothly, as with Th₁, Th₂ and A
     of the pair     (L(x + ε) - L(x - ε)) ε / 2σ²             sharp where they ripple, as with f
@@ -36,6 +37,9 @@ from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
 from vcjax.study.problem import Problem
 from vcjax.study.sweep import Experiment, replace_at
 
+_MEMORY = (0.7, 0.9)
+"""Adam's decay rates: there are a dozen steps and not thousands, and the first gradients are much the largest."""
+
 
 class Schedule(eqx.Module):
     """How long and how fast to go."""
@@ -44,20 +48,18 @@ class Schedule(eqx.Module):
     """Steps of the optimiser."""
     pairs_per_step: int = eqx.field(static=True, default=4)
     """Seeds of each scene that a step averages; each gives a pair of runs."""
-    spread: float = eqx.field(converter=number, default=0.2)
-    """σ of the neighbourhood over which the objective is averaged, in the free numbers; positive."""
     learning_rate: float = eqx.field(converter=number, default=0.3)
     """Of Adam, in the free numbers: about how far x goes in the first step; it falls to a tenth by a cosine.
     Positive."""
-    temperature_start: float = eqx.field(converter=number, default=2.0)
+    temperature_start: float = eqx.field(converter=number, default=1.0)
     """τ of the smoothing in the first step, in χ² units; positive."""
-    temperature_end: float = eqx.field(converter=number, default=0.5)
+    temperature_end: float = eqx.field(converter=number, default=0.25)
     """τ in the last; in between it changes by equal factors."""
 
     def __check_init__(self):
         for name in ("num_steps", "pairs_per_step"):
             require_count(self, name, 1)
-        for name in ("spread", "learning_rate", "temperature_start", "temperature_end"):
+        for name in ("learning_rate", "temperature_start", "temperature_end"):
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
 
     def temperature(self, step: int) -> float:
@@ -112,7 +114,7 @@ def descend(
         ValueError: if the objective is not finite at the start.
     """
     require_key("descend", key)
-    history, optimiser = list(history), optax.adam(schedule.learning_rates())
+    history, optimiser = list(history), optax.adam(schedule.learning_rates(), *_MEMORY)
     free = problem.to_free(start)
     state = optimiser.init(jnp.asarray(free))
     for step in history:
@@ -121,12 +123,12 @@ def descend(
     # Lanes: scenes × seeds × the two of a pair. Every pair has a seed of its own.
     number, pair, other = (axis.ravel() for axis in np.indices((num_scenes, schedule.pairs_per_step, 2)))
     seeds, lanes = number * schedule.pairs_per_step + pair, {"scene": number, "sign": 1.0 - 2.0 * other}
-    spread = jnp.asarray(schedule.spread)
+    spread = np.array([float(interval.spread) for interval in problem.intervals])
     for k in range(len(history), schedule.num_steps):
         temperature = schedule.temperature(k)
-        work = Partial(_value_and_gradient, problem, jnp.asarray(free), spread, jnp.asarray(temperature))
+        work = Partial(_value_and_gradient, problem, jnp.asarray(free), jnp.asarray(spread), jnp.asarray(temperature))
         runs = run_lanes(work, lanes, seeds, jax.random.fold_in(key, k))
-        step = _average(runs, problem.to_parameters(free), temperature, float(schedule.spread))
+        step = _average(runs, problem.to_parameters(free), temperature, spread)
         if not history and not np.isfinite(step.loss):
             raise ValueError(f"the objective is not finite at the start, {step.parameters}; start elsewhere.")
         history.append(step)
@@ -157,7 +159,7 @@ def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any,
 def _value_and_gradient(
     problem: Problem,
     free: Float[Array, " P"],
-    spread: Float[Array, ""],
+    spread: Float[Array, " P"],
     temperature: Float[Array, ""],
     lane: dict[str, Array],
     key: PRNGKeyArray,
@@ -181,7 +183,7 @@ def _value_and_gradient(
     return {"loss": value, "gradient": gradient, "shift": shift}
 
 
-def _average(runs: dict[str, np.ndarray], parameters: dict[str, float], temperature: float, spread: float) -> Step:
+def _average(runs: dict[str, np.ndarray], parameters: dict[str, float], temperature: float, spread: np.ndarray) -> Step:
     """Mean over the pairs that stayed finite, of both estimates of the gradient."""
     loss, gradient, shift = (runs[name].reshape(-1, 2, *runs[name].shape[1:]) for name in ("loss", "gradient", "shift"))
     is_finite = np.all(np.isfinite(loss), axis=1) & np.all(np.isfinite(gradient), axis=(1, 2))
