@@ -37,13 +37,13 @@ class Study:
     """Values along each axis of the grid."""
     grid_seeds: int = 5
     """Runs of each scene at every point of the grid."""
-    starts: int = 2
+    starts: int = 3
     """Descents."""
-    steps: int = 12
+    steps: int = 8
     """Steps of each."""
     pairs: int = 3
     """Pairs of runs of each scene in a step."""
-    choosing_seeds: int = 16
+    choosing_seeds: int = 12
     """Runs of each scene by which the best descent is chosen."""
     held_out_seeds: int = 200
     """Runs of each scene on which the two are compared."""
