@@ -129,21 +129,21 @@ class Objective(eqx.Module):
     """What is wanted of a setting: a weighted sum of the losses of this module. All weights are at least 0."""
 
     track_f1: float = eqx.field(converter=number, default=1.0)
-    """Of `f1_loss` of the tracks."""
+    """Weight of 1 - F1 of the tracks (`f1_loss`)."""
     track_cross_entropy: float = eqx.field(converter=number, default=0.0)
-    """Of `cross_entropy` of the tracks."""
+    """Weight of the `cross_entropy` of the tracks."""
     track_ranking: float = eqx.field(converter=number, default=0.0)
-    """Of `ranking_loss` of the tracks."""
+    """Weight of 1 - AUC of the tracks (`ranking_loss`)."""
     candidate_f1: float = eqx.field(converter=number, default=0.0)
-    """Of `f1_loss` of the candidates of all frames."""
+    """Weight of 1 - F1 of the candidates of all frames."""
     candidate_cross_entropy: float = eqx.field(converter=number, default=0.0)
-    """Of `cross_entropy` of the candidates."""
+    """Weight of the `cross_entropy` of the candidates."""
     position: float = eqx.field(converter=number, default=0.0)
-    """Of `position_rmse_m`, 1/m."""
+    """Weight of the position error (`position_rmse_m`), 1/m."""
     consistency: float = eqx.field(converter=number, default=0.0)
-    """Of `inconsistency`."""
+    """Weight of (ln ANEES)² of the position (`inconsistency`)."""
     camera_motion: float = eqx.field(converter=number, default=0.0)
-    """Of `camera_motion_m2_s2`, s²/m²."""
+    """Weight of the camera's mean square speed, (2πfA)²/2 (`camera_motion_m2_s2`), s²/m²."""
 
     def __check_init__(self):
         for name in vars(self):
