@@ -189,10 +189,10 @@ assert deleted[:2].min() > 10 > 1 > deleted[4:].max()
 # ## 3. Down by gradient
 #
 # A grid of two numbers is cheap enough; a grid of four is not, and a gradient costs about as much for four numbers as
-# for two. `tune` goes down by Adam. It starts where a textbook would: at 5.99, which 95 % of the squared distances of
-# a fitting measurement stay below. Each of the eight steps averages two pairs of runs in each scene, 64 runs in all;
-# then the end is compared with the start, first to choose between the two, and then on seeds that nothing has seen.
-# The learning rate is half the default: in so few steps Adam's momentum carries far.
+# for two. `tune` goes down it step by step. It starts where a textbook would: at 5.99, which 95 % of the squared
+# distances of a fitting measurement stay below. Each of the eight steps averages two pairs of runs in each scene, 64
+# runs in all; then the end is compared with the start, first to choose between the two, and then on seeds that nothing
+# has seen.
 
 # %%
 tuned = tune(
@@ -200,7 +200,7 @@ tuned = tune(
     soft_filter,
     THRESHOLDS,
     objective=objective,
-    schedule=Schedule(num_steps=8, pairs_per_step=2, learning_rate=0.15),
+    schedule=Schedule(num_steps=8, pairs_per_step=2),
     seeds=Seeds(choosing=4, held_out=20),
     key=jax.random.key(0),
 )
