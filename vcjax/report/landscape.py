@@ -55,9 +55,9 @@ def landscape_figure(
         axes.set_ylabel(_LABELS.get(y, y))
         _scale(axes, grid[x].values, grid[y].values)
         for path in paths:
-            axes.plot(
-                [p[x] for p in path], [p[y] for p in path], color="white", linewidth=1.2, marker=".", markersize=3
-            )
+            way = [p[x] for p in path], [p[y] for p in path]
+            axes.plot(*way, color="black", linewidth=2.4)  # an outline, for bright ground
+            axes.plot(*way, color="white", linewidth=1.2, marker=".", markersize=3)
         for (mark, setting), symbol in zip((marks or {}).items(), "os^D", strict=False):
             axes.plot(
                 setting[x], setting[y], symbol, color="#d55e00", markeredgecolor="white", markersize=8, label=mark
