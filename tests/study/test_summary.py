@@ -63,6 +63,17 @@ def test_per_run_equals_numbers_by_hand():
         np.testing.assert_allclose(figures[name], values, rtol=1e-14, err_msg=name)
 
 
+def test_movers_that_are_never_mapped_are_not_found():
+    runs = tiny_runs()
+    runs = runs.assign(
+        dynamic_margin=runs.dynamic_margin * np.nan,
+        dynamic_deletions=0 * runs.dynamic_deletions,
+        inconsistent_deletions=0 * runs.inconsistent_deletions,
+    )
+    np.testing.assert_array_equal(per_run(runs).detection_f1, 0.0)
+    assert per_run(runs.assign(is_moving=~runs.is_moving & False)).detection_f1.isnull().all()
+
+
 def test_summary_is_mean_and_standard_error_over_seeds():
     runs = fake_runs(num_seeds=7)
     figures, summary = per_run(runs), summarise(runs)

@@ -79,9 +79,9 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
     Errors are √(mean over frames of e²). A dynamic event is any deletion, by the gate's verdict or by the detector;
     `dynamic_found_per_run` and `static_deleted_per_run` count distinct moving and static features deleted at least
     once. With them, and with as many movers as were measured candidates or deleted, `detection_f1` is
-    2 found / (found + static deleted + movers); `detection_auc` is the area under the ROC of the features' largest
-    margin; both are NaN where there was no mover. `detection_delay_frames` is the mean over the movers found of the
-    frames from first birth to first deletion.
+    2 found / (found + static deleted + movers), NaN where nothing moves; `detection_auc` is the area under the ROC of
+    the features' largest margin, NaN where no mover was measured, or nothing else. `detection_delay_frames` is the mean
+    over the movers found of the frames from first birth to first deletion.
 
     ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter; frames where it is not
     defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `nis` is the mean squared
@@ -112,7 +112,7 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
                 "inconsistent_deletions_per_run": inconsistent,
                 "dynamic_found_per_run": found,
                 "static_deleted_per_run": (was_deleted & ~runs.is_moving).sum("feature"),
-                "detection_f1": 2 * found / (called + num_movers).where(num_movers > 0),
+                "detection_f1": (2 * found / np.maximum(called + num_movers, 1)).where(runs.is_moving.any("feature")),
                 "detection_auc": runs.detection_auc,
                 "detection_delay_frames": (runs.first_deleted - runs.first_mapped).where(is_found).mean("feature"),
                 "anees_position": runs.nees_position.mean("frame", skipna=True) / _DOF["anees_position"],
