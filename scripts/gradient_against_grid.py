@@ -14,7 +14,6 @@ import numpy as np
 import tyro
 
 import vcjax as vc
-from vcjax.commands.tune import WANTED
 from vcjax.report.tuning import write_search, write_tuning
 from vcjax.storage import write_file
 from vcjax.study.choice import Seeds
@@ -22,6 +21,7 @@ from vcjax.study.descent import Schedule
 from vcjax.study.evaluate import evaluate
 from vcjax.study.intervals import OSCILLATION, THRESHOLDS
 from vcjax.study.landscape import as_grid, search
+from vcjax.study.losses import WANTED
 from vcjax.study.scenes import Scenes
 from vcjax.study.summary import mean_and_error, student_t
 from vcjax.study.tune import tune

@@ -11,7 +11,6 @@ import jax
 import tyro
 
 import vcjax as vc
-from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.tuning import write_tuning
 from vcjax.study.choice import Seeds
 from vcjax.study.descent import Schedule
@@ -60,9 +59,9 @@ def main(study: Study) -> None:
         directory=study.out,
         progress=lambda name, done, total: print(f"{name}: {done} of {total}", flush=True),
     )
-    print(comparison_markdown(comparison(tuned.choice)))
     for path in write_tuning(tuned, {}, study.out):
         print(f"wrote {path}")
+    print((study.out / "tune.md").read_text())
 
 
 if __name__ == "__main__":

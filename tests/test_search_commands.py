@@ -44,7 +44,7 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     assert main(arguments) == 0 and (folder / "tune.json").read_bytes() == before
     said(capsys)
     assert main([*arguments, "--learning-rate", "0.1"]) == 1
-    assert_one_line(said(capsys)[1], "is of another schedule; give another directory")
+    assert_one_line(said(capsys)[1], "other settings (schedule: ", "give another directory")
 
 
 def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
@@ -76,7 +76,7 @@ def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
         (["tune", "thresholds", "--track-f1", "-1"], ["track_f1=-1"]),
         (["tune", "thresholds", "--landscape-points", "1"], ["--landscape-points 1", "at least 2"]),
         (["tune", "thresholds", "--frequency-hz", "6"], ["not below half the frame rate"]),
-        (["sweep", "--x", "config.gate.th3"], ["no number at 'config.gate.th3'"]),
+        (["sweep", "--x", "config.gate.th3"], ["no numeric leaf 'config.gate.th3'"]),
         (["sweep", "--x", "config.gate.th2"], ["two numbers", "config.gate.th2"]),
         (["sweep", "--x-range", "5", "1"], ["--x-range 5 1", "rising"]),
         (["sweep", "--y-range", "0", "1"], ["--y-range 0 1", "positive"]),

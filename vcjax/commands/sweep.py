@@ -7,15 +7,13 @@ import numpy as np
 from rich.console import Console
 
 from vcjax.commands.console import numbered_key, progress_bar, say
-from vcjax.commands.tune import WANTED
 from vcjax.devices import Cores
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.virtual_correction import VirtualCorrection
-from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.tuning import write_search
 from vcjax.study.choice import Seeds
 from vcjax.study.landscape import search
-from vcjax.study.losses import Objective
+from vcjax.study.losses import WANTED, Objective
 from vcjax.study.scenes import Scenes
 
 
@@ -81,8 +79,9 @@ class Sweep:
                 directory=self.out,
                 progress=lambda name, done, total: show(done, total, name),
             )
-        print(comparison_markdown(comparison(choice)))
-        for path in write_search(choice, self.out):
+        paths = write_search(choice, self.out)
+        print((self.out / "sweep.md").read_text())
+        for path in paths:
             say(console, f"wrote {path}")
 
 

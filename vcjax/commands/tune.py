@@ -11,19 +11,15 @@ from vcjax.commands.console import numbered_key, progress_bar, say
 from vcjax.devices import Cores
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.virtual_correction import VirtualCorrection
-from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.tuning import write_tuning
 from vcjax.study.choice import Seeds
 from vcjax.study.descent import Schedule
-from vcjax.study.intervals import THRESHOLDS, Interval
+from vcjax.study.intervals import OSCILLATION, THRESHOLDS
 from vcjax.study.landscape import around
-from vcjax.study.losses import Objective
+from vcjax.study.losses import WANTED, Objective
 from vcjax.study.scenes import Scenes
 from vcjax.study.tune import tune
 
-WANTED = Objective(track_f1=1.0, position=2.0, camera_motion=0.02)
-"""What a setting is wanted to do, unless one says otherwise: 5 cm of position error weigh as much as 0.1 of F1, and the
-paper's oscillation as much as 0.009."""
 What = Literal["thresholds", "oscillation", "joint"]
 
 
@@ -71,9 +67,10 @@ class Tune:
         """Tune, draw, report."""
         if self.landscape_points == 1 or self.landscape_points < 0:
             raise ValueError(f"--landscape-points {self.landscape_points}: give at least 2, or 0 for no landscape.")
+        ends = ((0.0, self.max_amplitude_m), self.frequency_band_hz)
         oscillation = {
-            "scenario.oscillation.amplitude_m": Interval(0.0, self.max_amplitude_m),
-            "scenario.oscillation.frequency_hz": Interval(*self.frequency_band_hz, spread=0.4),
+            path: dataclasses.replace(interval, low=low, high=high)
+            for (path, interval), (low, high) in zip(OSCILLATION.items(), ends, strict=True)
         }
         pairs = {"thresholds": THRESHOLDS, "oscillation": oscillation}
         chosen = pairs if self.what == "joint" else {self.what: pairs[self.what]}
@@ -109,6 +106,7 @@ class Tune:
                 for name, pair in chosen.items()
                 if self.landscape_points > 0
             }
-        print(comparison_markdown(comparison(tuned.choice)))
-        for path in write_tuning(tuned, landscapes, directory):
+        paths = write_tuning(tuned, landscapes, directory)
+        print((directory / "tune.md").read_text())
+        for path in paths:
             say(console, f"wrote {path}")

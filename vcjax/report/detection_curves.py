@@ -9,11 +9,10 @@ from vcjax.report.style import RC, new_figure
 from vcjax.study import roc
 from vcjax.study.choice import ALL, FALSE_RATE, Choice, tracks_of
 
-STYLES = {
+_STYLES = {
     "before": {"color": "#4d4d4d", "linestyle": (0, (5, 2))},
     "after": {"color": "#009e73", "linestyle": "-"},
 }
-"""How the two settings are drawn in all figures."""
 _RESAMPLES = 300
 
 
@@ -22,7 +21,7 @@ def curves_figure(choice: Choice) -> Figure:
     """Both curves over the tracks of all scenes and held-out seeds, with pointwise 95 % bands by bootstrap."""
     figure = new_figure(7.2, 3.6)
     left, right = figure.subplots(1, 2)
-    for tracks, (side, style) in zip(_tracks(choice), STYLES.items(), strict=True):
+    for tracks, (side, style) in zip(_tracks(choice), _STYLES.items(), strict=True):
         _draw(left, roc.FALSE_RATES, roc.recall_at, tracks[ALL], side, style)
         _draw(right, roc.RECALLS, roc.precision_at, tracks[ALL], side, style)
     _roc_axes(left)
@@ -47,7 +46,7 @@ def roc_by_scene_figure(choice: Choice) -> Figure:
     for axes in panels.flat[len(names) :]:
         axes.remove()
     for axes, name in zip(panels.flat, names, strict=False):
-        for tracks, (side, style) in zip((before, after), STYLES.items(), strict=True):
+        for tracks, (side, style) in zip((before, after), _STYLES.items(), strict=True):
             _draw(axes, roc.FALSE_RATES, roc.recall_at, tracks[name], side, style)
         _roc_axes(axes)
         axes.set_title(name)

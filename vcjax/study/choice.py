@@ -8,16 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from vcjax.fields import require_count
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study import roc
 from vcjax.study.evaluate import evaluate
 from vcjax.study.losses import Objective
-from vcjax.study.sweep import Experiment
+from vcjax.study.sweep import Experiment, number_at, require_paths
 
 Setting = dict[str, float]
 """Path of a numeric leaf → its value."""
@@ -53,23 +55,17 @@ class Choice(NamedTuple):
     """Runs of `before` (setting 0) and `after` (setting 1) on other seeds."""
 
 
-class Seeds(NamedTuple):
+class Seeds(eqx.Module):
     """How many runs of each scene there are, for each setting."""
 
-    choosing: int = 16
+    choosing: int = eqx.field(static=True, default=16)
     """To choose among the candidates."""
-    held_out: int = 100
+    held_out: int = eqx.field(static=True, default=100)
     """To compare the choice with what was there before."""
 
-    def check(self) -> None:
-        """Refuse empty sets.
-
-        Raises:
-            ValueError: naming which, and what to give.
-        """
-        for name, number in self._asdict().items():
-            if not isinstance(number, int | np.integer) or number < 1:
-                raise ValueError(f"Seeds({name}={number!r}): give a whole number of at least 1.")
+    def __check_init__(self):
+        for name in ("choosing", "held_out"):
+            require_count(self, name, 1)
 
 
 def choose(
@@ -96,9 +92,8 @@ def choose(
         progress: called with what is done, and how many settings of how many.
 
     Raises:
-        ValueError: as `evaluate`; for an empty set of seeds, or if no candidate has a finite run.
+        ValueError: as `evaluate`, or if no candidate has a finite run.
     """
-    seeds.check()
     choosing_key, held_out_key = jax.random.split(key)
 
     def judge(name: str, settings: Sequence[Setting], num_seeds: int, key) -> Any:
@@ -129,11 +124,12 @@ def setting_of(scenarios: Mapping[str, Scenario], config: FilterConfig, paths: S
     """The numbers at some paths, as scenes and configuration have them.
 
     Raises:
-        ValueError: for a number that differs between the scenes.
+        ValueError: for a path of no number, or a number that differs between the scenes.
     """
-    setting = {}
+    setting, experiments = {}, [Experiment(scenario, config) for scenario in scenarios.values()]
+    require_paths("settings", experiments[0], paths)
     for path in paths:
-        values = {_value_at(Experiment(scenario, config), path) for scenario in scenarios.values()}
+        values = {number_at(experiment, path) for experiment in experiments}
         if len(values) > 1:
             raise ValueError(f"{path} is {sorted(values)} in the scenes; give all the same.")
         setting[path] = values.pop()
@@ -157,17 +153,3 @@ def tracks_of(runs: Any) -> dict[str, roc.Tracks]:
         return roc.Tracks(score.values.reshape(num_seeds, -1), is_mover.values.reshape(num_seeds, -1))
 
     return {str(name): tracks(runs.sel(scene=name)) for name in runs.scene.values} | {ALL: tracks(runs)}
-
-
-def _value_at(tree: Any, path: str) -> float:
-    """The number at a path.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    try:
-        for name in path.split("."):
-            tree = tree[int(name)] if name.isdecimal() else getattr(tree, name)
-        return float(tree)
-    except (AttributeError, IndexError, TypeError):
-        raise ValueError(f"there is no number at {path!r}.") from None

@@ -1,8 +1,9 @@
 """Going down a smoothed objective by gradient, averaged over scenes and fresh seeds.
 
 Each parameter lives in an interval and is moved as a free number x (see `intervals`). A step averages the objective and
-its gradient over a mini-batch of seeds, new in every step, and over all scenes, and goes down it; the temperature of
-the smoothing falls from step to step.
+its gradient over a mini-batch of seeds, new in every step, and over all scenes, and goes down it by NovoGrad: momentum,
+in units of the gradient's norm. (Adam has a unit for each parameter, and moves one that hardly matters by its noise as
+far as the others.) The temperature of the smoothing falls from step to step.
 
 The derivative of one long run need not say where the mean of many goes: a run's phase of oscillation depends on f times
 its whole length, and its loss ripples with f over less than a tenth of a hertz, steeply. So what is made small is the
@@ -17,6 +18,7 @@ variances over the mini-batch. What a soft filter says of a setting is not what 
 looks at that.
 
 References:
+    Ginsburg et al. 2019, "Stochastic gradient methods with layer-wise adaptive moments for training of deep networks".
     Parmas, Rasmussen, Peters, Doya 2018, "PIPPS: Flexible model-based policy search robust to the curse of chaos".
 """
 
@@ -37,8 +39,8 @@ from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
 from vcjax.study.problem import Problem
 from vcjax.study.sweep import Experiment, replace_at
 
-_MEMORY = (0.6, 0.9)
-"""Decay rates of the optimiser: there are a dozen steps and not thousands, and the first gradients are the largest."""
+_MEMORY = (0.5, 0.9)
+"""Decay rates of the optimiser's momentum and of its scale: there are a dozen steps and not thousands."""
 
 
 class Schedule(eqx.Module):
@@ -48,8 +50,9 @@ class Schedule(eqx.Module):
     """Steps of the optimiser."""
     pairs_per_step: int = eqx.field(static=True, default=4)
     """Seeds of each scene that a step averages; each gives a pair of runs."""
-    learning_rate: float = eqx.field(converter=number, default=0.3)
-    """About how far x goes in the first step; it falls to a tenth by a cosine. Positive."""
+    learning_rate: float = eqx.field(converter=number, default=0.2)
+    """How far x goes in the first step, and half of how far later ones may; it falls to a tenth by a cosine.
+    Positive."""
     temperature_start: float = eqx.field(converter=number, default=1.0)
     """τ of the smoothing in the first step, in χ² units; positive."""
     temperature_end: float = eqx.field(converter=number, default=0.25)
@@ -66,9 +69,10 @@ class Schedule(eqx.Module):
         part = step / max(self.num_steps - 1, 1)
         return float(self.temperature_start * (self.temperature_end / self.temperature_start) ** part)
 
-    def learning_rates(self) -> optax.Schedule:
-        """The learning rate by the number of steps taken."""
-        return optax.cosine_decay_schedule(float(self.learning_rate), self.num_steps, alpha=0.1)
+    def optimiser(self) -> optax.GradientTransformation:
+        """What takes the steps."""
+        rates = optax.cosine_decay_schedule(float(self.learning_rate), self.num_steps, alpha=0.1)
+        return optax.novograd(rates, *_MEMORY)
 
 
 class Step(NamedTuple):
@@ -113,7 +117,7 @@ def descend(
         ValueError: if the objective is not finite at the start.
     """
     require_key("descend", key)
-    history, optimiser = list(history), _optimiser(schedule)
+    history, optimiser = list(history), schedule.optimiser()
     free = problem.to_free(start)
     state = optimiser.init(jnp.asarray(free))
     for step in history:
@@ -147,46 +151,11 @@ def end_of(problem: Problem, history: Sequence[Step]) -> dict[str, float]:
     return problem.to_parameters(np.mean([problem.to_free(step.parameters) for step in last], axis=0))
 
 
-class _Averages(NamedTuple):
-    """State of `_scale_by_norm`."""
-
-    num: Array
-    gradient: Array
-    squared_norm: Array
-
-
-def _scale_by_norm(decay: float, decay_of_norm: float) -> optax.GradientTransformation:
-    """A running mean of the gradient over the root of one of its squared norm, both freed of the bias of their start.
-
-    This is Adam with one scale for all parameters: one that hardly matters stays where it is, where Adam, which scales
-    each by itself, moves it as far as the others, by its noise.
-    """
-
-    def init(params):
-        return _Averages(jnp.zeros((), int), jnp.zeros_like(params), jnp.zeros((), params.dtype))
-
-    def update(updates, state, params=None):
-        del params
-        gradient = updates
-        num = state.num + 1
-        mean = decay * state.gradient + (1 - decay) * gradient
-        squared = decay_of_norm * state.squared_norm + (1 - decay_of_norm) * jnp.sum(gradient**2)
-        scale = jnp.sqrt(squared / (1 - decay_of_norm**num))
-        new = jnp.where(scale > 0, mean / (1 - decay**num) / jnp.where(scale > 0, scale, 1.0), 0.0)
-        return new, _Averages(num, mean, squared)
-
-    return optax.GradientTransformation(init, update)
-
-
-def _optimiser(schedule: Schedule) -> optax.GradientTransformation:
-    return optax.chain(_scale_by_norm(*_MEMORY), optax.scale_by_learning_rate(schedule.learning_rates()))
-
-
 def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any, step: Step) -> tuple[np.ndarray, Any]:
     """One step of the optimiser; none where no run was finite."""
     if not np.isfinite(step.loss):
         return free, state
-    update, state = optimiser.update(jnp.asarray(list(step.gradient.values())), state)
+    update, state = optimiser.update(jnp.asarray(list(step.gradient.values())), state, jnp.asarray(free))
     return free + np.asarray(update), state
 
 

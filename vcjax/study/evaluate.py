@@ -24,13 +24,25 @@ from vcjax.storage import remove_leftovers
 from vcjax.study.losses import Objective
 from vcjax.study.metrics import run_metrics
 from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
-from vcjax.study.results import PER_FEATURE, PER_FRAME, PER_RUN, describe, import_xarray, load, provenance, save
-from vcjax.study.sweep import Experiment, numeric_paths, replace_at
+from vcjax.study.results import (
+    PER_FEATURE,
+    PER_FRAME,
+    PER_RUN,
+    describe,
+    import_xarray,
+    load,
+    provenance,
+    refuse_other_settings,
+    save,
+)
+from vcjax.study.sweep import Experiment, replace_at, require_paths
 
 Settings = Mapping[str, Sequence[float] | np.ndarray]
 """Path of a numeric leaf → its value in each setting; all of one length."""
 RUNS_PER_BLOCK = 1024
 """Runs between two files, about: a minute of work, and a bound on memory."""
+_KEPT = ("loss", "dynamic_margin", "is_deleted", "is_moving", "is_finite")
+"""What a file of theirs holds at least."""
 
 
 def evaluate(
@@ -76,8 +88,10 @@ def evaluate(
         part = {path: values[first:end] for path, values in columns.items()}
         origin = _origin(scenarios, config, part, objective, num_seeds, key)
         path = None if directory is None else Path(directory) / f"settings_{first:05d}-{end - 1:05d}.nc"
-        block = None if path is None or not path.is_file() else _kept(path, origin)
-        if block is None:
+        if path is not None and path.is_file():
+            block = load(path, _KEPT)
+            refuse_other_settings(path, block.attrs, origin)
+        else:
             block = _run_block(scenarios, config, part, objective, num_seeds, key)
             block = block.assign_coords(setting=np.arange(first, end)).assign_attrs(origin)
             if path is not None:
@@ -124,10 +138,7 @@ def _columns(scenarios, config, settings: Settings, num_seeds: int, key) -> dict
         raise ValueError("evaluate(settings): give every path a list of values, all of one length, at least 1.")
     for scenario in scenarios.values():
         experiment = Experiment(scenario, config)
-        known = list(numeric_paths(experiment))
-        for path in columns:
-            if path not in known:
-                raise ValueError(f"there is no numeric leaf {path!r}; choose among: {', '.join(known)}.")
+        require_paths("evaluate", experiment, columns)
         for values in zip(*columns.values(), strict=True):
             replace_at(experiment, dict(zip(columns, values, strict=True)))
     return columns
@@ -156,12 +167,11 @@ def _run_block(scenarios, config, columns, objective: Objective, num_seeds: int,
     dims = {name: (*outer, axis) if axis else outer for names, axis in kinds for name in names}
     dims |= {"is_moving": (*outer, "feature"), "loss": outer}
     runs = xr.Dataset({name: (dims[name], found[name]) for name in dims})
-    is_deleted = runs.first_deleted > 0
     figures = per_run(runs).assign(
         loss=runs.loss.where(runs.is_finite),
         map_full_frames=runs.map_full_frames,
         dynamic_margin=runs.dynamic_margin.where(runs.is_finite),
-        is_deleted=is_deleted & runs.is_finite,
+        is_deleted=(runs.first_deleted > 0) & runs.is_finite,
         is_moving=runs.is_moving.isel(setting=0, seed=0),
     )
     coordinates: dict[str, Any] = {path: ("setting", values) for path, values in columns.items()}
@@ -185,16 +195,3 @@ def _origin(scenarios, config, columns, objective: Objective, num_seeds: int, ke
         "objective": json.dumps(describe(objective)),
         "num_seeds": num_seeds,
     }
-
-
-def _kept(path: Path, origin: dict[str, Any]) -> Any:
-    """A block that is there already.
-
-    Raises:
-        ValueError: if it is of other settings, or not readable.
-    """
-    block = load(path, ("loss", "dynamic_margin", "is_deleted", "is_moving", "is_finite"))
-    for name, value in origin.items():
-        if block.attrs.get(name) != value:
-            raise ValueError(f"{path} is of another {name}; give another directory, or remove this one.")
-    return block

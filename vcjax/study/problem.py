@@ -1,6 +1,6 @@
 """What is tuned: an objective of runs in some scenes, as a function of free numbers."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from vcjax.simulation.scenarios import Scenario
 from vcjax.study.evaluate import stacked
 from vcjax.study.intervals import Interval
 from vcjax.study.losses import Objective
-from vcjax.study.sweep import Experiment, numeric_paths
+from vcjax.study.sweep import Experiment, require_paths
 
 MAX_AMPLITUDE_M = 0.5
 """How far a camera on a robot can be thought to swing to either side, m."""
@@ -40,7 +40,13 @@ class Problem(eqx.Module):
         Raises:
             ValueError: for a parameter outside its interval.
         """
-        return np.array([self._named(path, i.to_free, parameters[path]) for path, i in self._each()])
+        free = []
+        for path, interval in self._each():
+            try:
+                free.append(interval.to_free(parameters[path]))
+            except ValueError as error:
+                raise ValueError(f"{path}: {error}") from None
+        return np.array(free)
 
     def to_parameters(self, free: np.ndarray) -> dict[str, float]:
         """The parameters of some free numbers."""
@@ -48,13 +54,6 @@ class Problem(eqx.Module):
 
     def _each(self) -> Iterator[tuple[str, Interval]]:
         return zip(self.paths, self.intervals, strict=True)
-
-    @staticmethod
-    def _named(path: str, function: Callable[[float], float], value: float) -> float:
-        try:
-            return function(value)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
 
 
 def problem_of(
@@ -85,10 +84,8 @@ def problem_of(
     if not isinstance(parameters, Mapping) or not parameters:
         raise ValueError(f"tune(parameters={parameters!r}): give at least one path with its interval.")
     rate = min(float(scenario.frame_rate_hz) for scenario in scenarios.values())
-    known = list(numeric_paths(Experiment(next(iter(scenarios.values())), config)))
+    require_paths("tune", Experiment(next(iter(scenarios.values())), config), parameters)
     for path, interval in parameters.items():
-        if path not in known:
-            raise ValueError(f"tune has no numeric leaf {path!r}; choose among: {', '.join(known)}.")
         require_kind("tune", f"parameters[{path!r}]", interval, Interval, "give an Interval(low, high).")
         if path == "scenario.oscillation.frequency_hz" and interval.high > rate / 2:
             raise ValueError(

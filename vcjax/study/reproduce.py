@@ -6,7 +6,6 @@ smaller one. Several processes share the blocks: each runs and writes its own pa
 finds them all.
 """
 
-import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from numbers import Integral
@@ -28,7 +27,7 @@ from vcjax.simulation.scenarios import paper
 from vcjax.storage import remove_leftovers, write_file
 from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.paper import TABLES, Cell, cells
-from vcjax.study.results import attributes, load, load_attributes, save
+from vcjax.study.results import attributes, load, load_attributes, refuse_other_settings, save
 from vcjax.study.sweep import Experiment
 
 SEEDS_PER_BLOCK = 25
@@ -132,7 +131,7 @@ def _prepare(directory: Path, key: PRNGKeyArray) -> None:
     """Refuse a directory of other settings or that cannot be written, and clear what killed processes left."""
     for cell in cells():
         for _, _, path in _blocks(directory / "runs" / cell.identifier):
-            _refuse_other_settings(path, cell_experiment(cell), key)
+            refuse_other_settings(path, load_attributes(path), attributes(cell_experiment(cell), key))
         remove_leftovers(directory / "runs" / cell.identifier, "seeds_*.nc")
     write_file(directory / "README.txt", _README.encode())  # also tells at once whether the place can be written
 
@@ -185,17 +184,6 @@ def _blocks(folder: Path) -> Iterator[tuple[int, int, Path]]:
             yield int(match[1]), int(match[2]) + 1, path
 
 
-def _refuse_other_settings(path: Path, experiment: Experiment, key: PRNGKeyArray) -> None:
-    """Refuse to mix results of different settings."""
-    found = load_attributes(path)
-    for name, value in attributes(experiment, key).items():
-        if found.get(name) != value:
-            raise ValueError(
-                f"{path} has other settings ({name}: {_short(found.get(name))}, now {_short(value)}); "
-                "give another directory, or remove this one."
-            )
-
-
 def _join(blocks: list[Any]) -> Any:
     """Blocks of one cell as one data set; what does not depend on the seed is taken from the first."""
     import xarray as xr
@@ -203,11 +191,6 @@ def _join(blocks: list[Any]) -> Any:
     unique = [block.sel(seed=~block.get_index("seed").duplicated()) for block in blocks]
     joined = xr.concat(unique, "seed", data_vars="minimal", coords="minimal", compat="override", join="override")
     return joined.isel(seed=np.unique(joined.seed.values, return_index=True)[1])
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) < 60 else text[:57] + "..."
 
 
 _README = """\

@@ -8,7 +8,7 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -123,6 +123,30 @@ def provenance(key: PRNGKeyArray) -> dict[str, Any]:
         "dtype": str(jax.dtypes.canonicalize_dtype(np.float64)),
         "vcjax": _version(),
     }
+
+
+def refuse_other_settings(path: str | os.PathLike, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Refuse to mix work of different settings.
+
+    Args:
+        path: where the work was found.
+        found: what it comes from.
+        expected: what it is to come from; what else is found does not matter.
+
+    Raises:
+        ValueError: naming the first setting that differs.
+    """
+    for name, value in expected.items():
+        if found.get(name) != value:
+            raise ValueError(
+                f"{path} has other settings ({name}: {_short(found.get(name))}, now {_short(value)}); "
+                "give another directory, or remove this one."
+            )
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 60 else text[:57] + "..."
 
 
 def _version() -> str:

@@ -4,7 +4,7 @@ An element of a vector is named by its place: `scenario.odometry_std.0` is the f
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -68,6 +68,25 @@ def numeric_paths(tree: Any) -> Iterator[str]:
             yield from (f"{field.name}.{i}" for i in range(len(value)))
 
 
+def require_paths(owner: str, tree: Any, paths: Iterable[str]) -> None:
+    """Refuse paths of which a tree has no numeric leaf.
+
+    Raises:
+        ValueError: naming the first, and those there are.
+    """
+    known = list(numeric_paths(tree))
+    for path in paths:
+        if path not in known:
+            raise ValueError(f"{owner} has no numeric leaf {path!r}; choose among: {', '.join(known)}.")
+
+
+def number_at(tree: Any, path: str) -> float:
+    """The number at a path that there is."""
+    for name in path.split("."):
+        tree = tree[int(name)] if name.isdecimal() else getattr(tree, name)
+    return float(tree)
+
+
 def check_sweep(experiment: Experiment, sweep: Sweep) -> dict[str, np.ndarray]:
     """The swept values as arrays.
 
@@ -78,11 +97,9 @@ def check_sweep(experiment: Experiment, sweep: Sweep) -> dict[str, np.ndarray]:
     require_kind(
         "monte_carlo", "sweep", sweep, Mapping, 'give paths with their values, {"config.gate.th1": [6, 9, 12]}.'
     )
-    known = list(numeric_paths(experiment))
+    require_paths("sweep", experiment, sweep)
     values = {}
     for path, listed in sweep.items():
-        if path not in known:
-            raise ValueError(f"sweep has no numeric leaf {path!r}; choose among: {', '.join(known)}.")
         try:
             values[path] = np.asarray(listed, float)
         except (TypeError, ValueError):

@@ -24,7 +24,7 @@ from vcjax.study.descent import Schedule, Step, descend, end_of
 from vcjax.study.intervals import Interval
 from vcjax.study.losses import Objective
 from vcjax.study.problem import Problem, problem_of
-from vcjax.study.results import describe, import_xarray, provenance
+from vcjax.study.results import describe, import_xarray, provenance, refuse_other_settings
 
 _MARGIN = 0.1
 """How near to the ends of their intervals starts are drawn, as a part of these."""
@@ -37,7 +37,6 @@ class Tuned(NamedTuple):
     """Every step from every start; the first start is where the parameters were."""
     choice: Choice
     """Where they were, the best end of a descent, and what it is worth."""
-
     num_runs: int
     """Runs in the descents, each with its derivative."""
 
@@ -48,7 +47,7 @@ class Tuned(NamedTuple):
 
     @property
     def num_failed(self) -> int:
-        """Runs left out of steps because they, or their derivative, went non-finite."""
+        """Pairs of runs left out of steps because one, or its derivative, went non-finite."""
         return sum(step.num_failed for steps in self.descents for step in steps)
 
 
@@ -91,15 +90,13 @@ def tune(
     schedule, directory = schedule or Schedule(), None if directory is None else Path(directory)
     if not isinstance(num_starts, int | np.integer) or num_starts < 1:
         raise ValueError(f"tune(num_starts={num_starts!r}): give a whole number of at least 1.")
-    seeds = seeds or Seeds()
-    seeds.check()
     problem = problem_of(scenarios, config, parameters, objective)
     starts = _starts(problem, setting_of(scenarios, config, problem.paths), num_starts)
     origin = _origin(scenarios, problem, schedule, key)
     descent_key, choice_key = jax.random.split(key)
     descents = []
     for number, start in enumerate(starts):
-        kept = None if directory is None else KeptSteps(directory / "descents" / f"start_{number}.json", origin, start)
+        kept = None if directory is None else _KeptSteps(directory / "descents" / f"start_{number}.json", origin, start)
 
         def told(history: list[Step], kept=kept, number=number):
             if kept is not None:
@@ -122,7 +119,7 @@ def tune(
         config,
         [starts[0], *(end_of(problem, steps) for steps in descents)],
         objective=problem.objective,
-        seeds=seeds,
+        seeds=seeds or Seeds(),
         key=choice_key,
         directory=directory,
         progress=progress,
@@ -151,7 +148,7 @@ def _origin(scenarios, problem: Problem, schedule: Schedule, key) -> dict[str, A
     }
 
 
-class KeptSteps(NamedTuple):
+class _KeptSteps(NamedTuple):
     """The file of a descent's steps."""
 
     path: Path
@@ -176,7 +173,5 @@ class KeptSteps(NamedTuple):
             found, steps = content["origin"] | {"start": content["start"]}, [Step(**s) for s in content["steps"]]
         except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"{self.path}: no steps of a descent ({error}); remove it and run again.") from None
-        for name, value in json.loads(json.dumps(self.origin | {"start": self.start})).items():
-            if found.get(name) != value:
-                raise ValueError(f"{self.path} is of another {name}; give another directory, or remove this one.")
+        refuse_other_settings(self.path, found, json.loads(json.dumps(self.origin | {"start": self.start})))
         return steps
