@@ -91,6 +91,18 @@ class Truth(eqx.Module):
     """Whether a feature moves at any time."""
 
 
+def moves_in_frame(truth: Truth) -> Bool[Array, "T F"]:
+    """Whether each feature moves in each frame: is elsewhere than in the frame before (the first: than in the second).
+
+    A mover that starts late or stops does not move in the other frames, though `is_moving` says so of it.
+    """
+    landmarks = jnp.asarray(truth.landmarks_m)
+    if landmarks.shape[0] == 1:
+        return jnp.asarray(truth.is_moving)[None]
+    moves = jnp.any(landmarks[1:] != landmarks[:-1], axis=-1)
+    return jnp.concatenate([moves[:1], moves])
+
+
 def last_sightings(track_id: Int[AnyArray, "T V"], is_valid: Bool[AnyArray, "T V"]) -> Bool[np.ndarray, "T V"]:
     """Which entries are the last valid one of their track in a recording that is known to its end.
 

@@ -148,7 +148,7 @@ BAD_PAPERS = {
     "unknown robot": (dict(robot="backward"), r"paper\(robot='backward'\): choose one of \('forward', 'curved'"),
     "unknown motion": (dict(dynamic="up"), r"paper\(dynamic='up'\): choose one of"),
     "unknown noise": (dict(noise="none"), r"paper\(noise='none'\): choose one of"),
-    "unknown set": (dict(dynamic_set="all"), r"paper\(dynamic_set='all'\): choose one of \('ahead', 'near_path'\)"),
+    "unknown set": (dict(dynamic_set="all"), r"paper\(dynamic_set='all'\): choose one of \('ahead', 'near_path', 'b"),
     "id too large": (dict(dynamic_set=[5, 162]), r"Scenario\(movers.ids=\[5, 162\]\): there are 162 features"),
     "id negative": (dict(dynamic_set=[-1]), r"Scenario\(movers.ids=\[-1\]\)"),
     "id not whole": (dict(dynamic_set=[1.5]), r"Movers\(ids=\[1.5\]\): .*whole numbers"),

@@ -1,7 +1,7 @@
 """Scenarios: the paper's Table 1 and experiments, every number a parameter."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -10,11 +10,12 @@ from jaxtyping import Array, Float
 from vcjax.fields import is_concrete, number, require, require_count, require_kind, vector
 from vcjax.models.camera import Camera
 from vcjax.models.motion import Oscillation
-from vcjax.simulation.world import Movers, features_at, features_drawn, grid, is_feature
+from vcjax.simulation.courses import CourseName, drawn_course, named_course
+from vcjax.simulation.world import Movers, features_at, features_drawn, features_near, grid, is_feature
 
 RobotMotion = Literal["forward", "curved", "lateral"]
-DynamicMotion = Literal["lateral", "inverse_forward"]
-DynamicSet = Literal["ahead", "near_path"]
+DynamicMotion = Literal["lateral", "inverse_forward", "drawn"]
+DynamicSet = Literal["ahead", "near_path", "bus_3", "bus_12", "bus_24", "bus_48"]
 Triple = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
 
@@ -30,7 +31,10 @@ DYNAMIC_PLACES_M = {
     "ahead": [(4.0, y, z) for y in (-2.0, 0.0, 2.0) for z in (0.0, 1.0)],
     "near_path": [(x, y, 0.0) for x in (0.0, 4.0, 8.0) for y in (-2.0, 2.0)],
 }
-DIRECTIONS = {"lateral": (0.0, 1.0, 0.0), "inverse_forward": (-1.0, 0.0, 0.0)}
+# A bus: the features nearest to the middle of those ahead. All 48 are in view when the robot starts.
+BUSES = {"bus_3": 3, "bus_12": 12, "bus_24": 24, "bus_48": 48}
+BUS_CENTRE_M = (4.0, 0.0, 0.5)
+DIRECTIONS = {"lateral": (0.0, 1.0, 0.0), "inverse_forward": (-1.0, 0.0, 0.0), "drawn": (1.0, 0.0, 0.0)}
 # Start x, y (m) and yaw (deg); increment x, y (m) and yaw (deg) per frame, in the robot frame.
 ROBOT_MOTIONS = {
     "forward": ((-8.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
@@ -60,6 +64,10 @@ class Scenario(eqx.Module):
     """Noise of the odometry per frame: x, y, z (m), rotation about x, y, z (deg). Default: planar, Table 1."""
     pixel_std_px: float = eqx.field(converter=number, default=1.0)
     """Noise of a measured pixel, px."""
+    oscillation_std_m: float = eqx.field(converter=number, default=0.0)
+    """How far the camera's true sideways displacement is from the commanded one, standard deviation in each frame, m.
+    Independent from frame to frame: its change since the last frame has √2 of it, which is what the filter's
+    `oscillation_std_m` is about. 0: as commanded."""
     frame_rate_hz: float = eqx.field(converter=number, default=10.0)
     """Frames per second."""
     num_frames: int = eqx.field(static=True, default=160)
@@ -75,7 +83,8 @@ class Scenario(eqx.Module):
         for name, length in (("start", 3), ("increment", 3), ("mount", 6)):
             require(self, name, np.isfinite, "give finite numbers.", length)
         require(self, "odometry_std", lambda s: np.isfinite(s) & (s >= 0), "standard deviations are at least 0.", 6)
-        require(self, "pixel_std_px", lambda s: np.isfinite(s) & (s >= 0), "a standard deviation is at least 0.")
+        for name in ("pixel_std_px", "oscillation_std_m"):
+            require(self, name, lambda s: np.isfinite(s) & (s >= 0), "a standard deviation is at least 0.")
         require(self, "frame_rate_hz", lambda r: np.isfinite(r) & (r > 0), "give a positive rate.")
         require_count(self, "num_frames", 1)
         ids, num_features = self.movers.ids, shape[-2]
@@ -116,6 +125,8 @@ def paper(
     dynamic_places_m: Sequence[Triple] = (),
     dynamic_drawn: int | None = None,
     dynamic_seed: int = 0,
+    dynamic_course: CourseName | None = None,
+    oscillation_error_std_m: float = 0.0,
     grid_low_m: float = -8.0,
     grid_high_m: float = 8.0,
     grid_per_side: int = 9,
@@ -126,9 +137,11 @@ def paper(
     Args:
         robot: forward along x from (-8, 0); curved by 0.5° per frame from (-8, -8); or lateral along y, looking
             along x, from (-4, -4).
-        dynamic: None for a static scene, or how the dynamic features move: lateral (+y) or inverse forward (-x).
+        dynamic: None for a static scene, or how the dynamic features move: lateral (+y), inverse forward (-x), or each
+            in a direction and at half to one and a half of the speed as `dynamic_seed` draws them.
         dynamic_speed_m_s: their speed, m/s, at least 0.
-        dynamic_set: the six features ahead of the robot, the six near its path, or feature ids of one's own.
+        dynamic_set: the six features ahead of the robot, the six near its path, a bus of 3, 12, 24 or 48 side by side
+            ahead of it, or feature ids of one's own.
         oscillation_amplitude_m: A of equation (1), m; 0 is the steady camera, the paper's oscillating one has 0.05.
         oscillation_frequency_hz: f of equation (1), Hz, below half the frame rate.
         noise: odometry noise of Table 1 in the plane (x, y, yaw) or on all six axes.
@@ -146,7 +159,11 @@ def paper(
         dynamic_direction: direction of the dynamic features instead of a named motion; its length means nothing.
         dynamic_places_m: the dynamic features by their places x, y, z (m) instead of a set.
         dynamic_drawn: how many dynamic features to draw among all features, instead of a set.
-        dynamic_seed: seed of that draw, and of nothing else.
+        dynamic_seed: seed of that draw and of drawn directions and speeds, and of nothing else.
+        dynamic_course: None for constant velocities; or late (they start after a quarter of the run), stops (half-way),
+            stops_and_starts (they stand in the second quarter) or turns (to the left in the second quarter, and back).
+        oscillation_error_std_m: how far the camera is from its commanded displacement, standard deviation, m (the
+            filter assumes its own).
         grid_low_m: lowest x and y of the square grid of features, m.
         grid_high_m: highest x and y, m.
         grid_per_side: features along each side.
@@ -166,13 +183,18 @@ def paper(
         raise ValueError(f"paper(dynamic={dynamic!r}, dynamic_direction={dynamic_direction}): give one of the two.")
     is_static = dynamic is None and dynamic_direction is None
     landmarks = grid(grid_low_m, grid_high_m, grid_per_side, grid_heights_m)
+    ids = _dynamic_ids(landmarks, dynamic_set, dynamic_places_m, dynamic_drawn, dynamic_seed, is_static)
+    course = None if dynamic_course is None else named_course(dynamic_course, num_frames / frame_rate_hz)
+    if dynamic == "drawn":
+        course = drawn_course(len(ids), dynamic_seed, course)
     place, (x, y, yaw_deg) = ROBOT_MOTIONS[robot]
     return Scenario(
         landmarks_m=landmarks,
         movers=Movers(
-            ids=_dynamic_ids(landmarks, dynamic_set, dynamic_places_m, dynamic_drawn, dynamic_seed, is_static),
+            ids=ids,
             direction=DIRECTIONS[dynamic or "lateral"] if dynamic_direction is None else dynamic_direction,
             speed_m_s=0.0 if is_static else dynamic_speed_m_s,
+            course=course,
         ),
         oscillation=Oscillation(oscillation_amplitude_m, oscillation_frequency_hz),
         camera=Camera(intrinsics_px, image_size_px, tuple(distortion)),
@@ -181,9 +203,42 @@ def paper(
         mount=mount,
         odometry_std=ODOMETRY_STD[noise] if odometry_std is None else odometry_std,
         pixel_std_px=pixel_error_std_px,
+        oscillation_std_m=oscillation_error_std_m,
         frame_rate_hz=frame_rate_hz,
         num_frames=num_frames,
     )
+
+
+HARDER: dict[str, dict[str, Any]] = {
+    "late": {"dynamic_course": "late"},
+    "stops": {"dynamic_course": "stops"},
+    "stops_and_starts": {"dynamic_course": "stops_and_starts"},
+    "turns": {"dynamic_course": "turns"},
+    "drawn": {"dynamic": "drawn", "dynamic_drawn": 12},
+    **{name: {"dynamic_set": name} for name in BUSES},
+    "jitter_2_mm": {"oscillation_error_std_m": 0.002},
+    "jitter_5_mm": {"oscillation_error_std_m": 0.005},
+}
+"""Scenes harder than the paper's, by what they change in `paper`."""
+
+
+def harder(name: str, **options: Any) -> Scenario:
+    """A scene harder than the paper's, by its name in `HARDER`.
+
+    The robot moves forward, the camera oscillates by 0.05 m at 3 Hz, and features move sideways at 0.5 m/s.
+
+    Args:
+        name: what makes it harder: movers that start late, stop, stop and start, or turn; directions, speeds and places
+            drawn at random; 3 to 48 features that move together as a bus; or an oscillation known up to 2 or 5 mm.
+        options: of `paper`, instead.
+
+    Raises:
+        ValueError: for an unknown name, or as `paper`.
+    """
+    if name not in HARDER:
+        raise ValueError(f"harder({name!r}): choose one of {tuple(HARDER)}.")
+    usual = {"dynamic": "lateral", "dynamic_speed_m_s": 0.5, "oscillation_amplitude_m": 0.05}
+    return paper(**usual | HARDER[name] | options)
 
 
 def _dynamic_ids(
@@ -204,10 +259,11 @@ def _dynamic_ids(
         return features_at(landmarks, places_m)
     if not isinstance(dynamic_set, str):
         return dynamic_set
+    if dynamic_set in BUSES:
+        return np.sort(features_near(landmarks, BUS_CENTRE_M, BUSES[dynamic_set]))
     if dynamic_set not in DYNAMIC_PLACES_M:
-        raise ValueError(
-            f"paper(dynamic_set={dynamic_set!r}): choose one of {tuple(DYNAMIC_PLACES_M)}, or give feature ids."
-        )
+        sets = (*DYNAMIC_PLACES_M, *BUSES)
+        raise ValueError(f"paper(dynamic_set={dynamic_set!r}): choose one of {sets}, or give feature ids.")
     preset = np.array(DYNAMIC_PLACES_M[dynamic_set])
     # Where nothing moves, the grid may lack the preset's places.
     return np.sort(features_at(landmarks, preset[is_feature(landmarks, preset)] if is_static else preset))

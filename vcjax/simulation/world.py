@@ -8,9 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from vcjax.fields import is_concrete, number, require, vector
+from vcjax.fields import is_concrete, number, require, require_kind, vector
+from vcjax.simulation.courses import Course, displacements, has_moved, require_course
 
 PLACE_TOLERANCE_M = 1e-3
 """How far from a feature a place may lie that means it, m: room for decimals, and far less than features are apart."""
@@ -44,7 +45,7 @@ def _as_ids(value: Any) -> Any:
 
 
 class Movers(eqx.Module):
-    """Features that move with one constant velocity from the first frame on."""
+    """Features that move: with one constant velocity from the first frame on, or on courses of several legs."""
 
     ids: Int[Array | np.ndarray, " D"] = eqx.field(converter=_as_ids)
     """Which features, each once."""
@@ -52,6 +53,8 @@ class Movers(eqx.Module):
     """Direction of motion in the world; its length means nothing, but is not 0."""
     speed_m_s: float = eqx.field(converter=number, default=0.0)
     """Speed, m/s; 0: they stand still and count as static."""
+    course: Course | None = None
+    """When they go, how fast and where to, relative to direction and speed; None: constant velocity."""
 
     def __check_init__(self):
         _check_ids(self.ids)
@@ -60,6 +63,9 @@ class Movers(eqx.Module):
         require(
             self, "speed_m_s", lambda v: np.isfinite(v) & (v >= 0), "a speed is at least 0; turn the direction round."
         )
+        if self.course is not None:
+            require_kind("Movers", "course", self.course, Course, "give a Course, or None.")
+            require_course(self.course, self.ids.shape[0])
 
 
 def _check_ids(ids: Int[Array | np.ndarray, " D"]) -> None:
@@ -74,10 +80,27 @@ def _check_ids(ids: Int[Array | np.ndarray, " D"]) -> None:
 
 
 def velocities(movers: Movers, num_features: int) -> Float[Array, "F 3"]:
-    """Velocity of every feature, m/s. Derivative exact."""
-    direction = jnp.asarray(movers.direction)
-    velocity = movers.speed_m_s * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
+    """Velocity of every feature at the movers' speed in their direction, m/s. Derivative exact."""
+    velocity = _velocity(movers)
     return jnp.zeros((num_features, 3), velocity.dtype).at[jnp.asarray(movers.ids)].set(velocity)
+
+
+def _velocity(movers: Movers) -> Float[Array, "3"]:
+    direction = jnp.asarray(movers.direction)
+    return movers.speed_m_s * direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def moved(
+    movers: Movers, landmarks_m: Float[Array, "F 3"], time_s: Float[Array, " T"]
+) -> tuple[Float[Array, "T F 3"], Bool[Array, " F"]]:
+    """Where every feature is at each time, m, and whether it moves at any time up to the last. Derivative exact."""
+    if movers.course is None:
+        velocity = velocities(movers, landmarks_m.shape[0])
+        return landmarks_m + time_s[:, None, None] * velocity, jnp.any(velocity != 0, axis=-1)
+    ids, course = jnp.asarray(movers.ids), (movers.course, _velocity(movers), movers.ids.shape[0])
+    places = jnp.broadcast_to(landmarks_m, (len(time_s), *landmarks_m.shape))
+    is_moving = jnp.zeros(len(landmarks_m), bool).at[ids].set(has_moved(*course, time_s[-1]))
+    return places.at[:, ids].add(displacements(*course, time_s)), is_moving
 
 
 def is_feature(landmarks_m: Float[np.ndarray, "F 3"], places_m: Any) -> np.ndarray:
@@ -108,6 +131,20 @@ def features_at(landmarks_m: Float[np.ndarray, "F 3"], places_m: Any) -> Int[np.
                 f"features_at(places_m[{i}]={place.tolist()}): feature {ids[i]} comes twice; give each once."
             )
     return ids.astype(np.int32)
+
+
+def features_near(landmarks_m: Float[np.ndarray, "F 3"], place_m: Sequence[float], num: int) -> Int[np.ndarray, " D"]:
+    """Ids of the `num` features nearest to a place, the nearest first, and of equally near ones the lower id.
+
+    Raises:
+        ValueError: for a number that is not one from 0 to that of the features.
+    """
+    if not isinstance(num, Integral) or not 0 <= num <= len(landmarks_m):
+        raise ValueError(
+            f"features_near(num={num!r}): give a whole number from 0 to {len(landmarks_m)}, all there are."
+        )
+    distances = np.round(_distances(landmarks_m, [place_m])[0], 6)  # rounding error must not break a tie
+    return np.argsort(distances, kind="stable")[:num].astype(np.int32)
 
 
 def features_drawn(num_features: int, num_drawn: int, seed: int) -> Int[np.ndarray, " D"]:

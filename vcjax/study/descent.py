@@ -169,7 +169,7 @@ def _value_and_gradient(
 ) -> dict[str, Array]:
     """Objective of one run of one scene at x ± ε, and its derivative by the free numbers, in forward mode."""
     scenario = scene(problem.scenes, lane["scene"])
-    # A run draws from the folds 0 to 2 of its key.
+    # A run draws from the folds 0 to 2 and 4 of its key.
     shift = spread * jax.random.normal(jax.random.fold_in(key, 3), free.shape, free.dtype)
 
     def loss(free):
