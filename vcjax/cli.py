@@ -13,6 +13,7 @@ from rich.console import Console
 
 from vcjax.commands.bench import Bench
 from vcjax.commands.console import say
+from vcjax.commands.detectability import Detectability
 from vcjax.commands.paper import Report, Reproduce
 from vcjax.commands.run import Run
 from vcjax.commands.sweep import Sweep
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(arguments: list[str]) -> Reproduce | Report | Run | Tune | Sweep | Bench:
+def _parse(arguments: list[str]) -> Reproduce | Report | Run | Tune | Sweep | Detectability | Bench:
     """The command with its options. The gate's own options depend on the gate, so that is looked up first."""
     gate = _gate_name(arguments)
     default = Run(scenario=tyro.MISSING, config=FilterConfig(gate=GATES[gate]()))
@@ -61,6 +62,7 @@ def _parse(arguments: list[str]) -> Reproduce | Report | Run | Tune | Sweep | Be
         | Annotated[Run, tyro.conf.subcommand("run", default=default)]
         | Annotated[Tune, tyro.conf.subcommand("tune")]
         | Annotated[Sweep, tyro.conf.subcommand("sweep")]
+        | Annotated[Detectability, tyro.conf.subcommand("detectability")]
         | Annotated[Bench, tyro.conf.subcommand("bench")]
     )
     told = io.StringIO()

@@ -193,7 +193,7 @@ def mover_power(scenario: Scenario, test: VelocityTest) -> Float[Array, " D"]:
         velocity = scenario.movers.speed_m_s * direction / jnp.linalg.norm(direction)
         return survival(q, found.score @ velocity)
     # In an empty direction of C there is no score either; the ridge keeps 0/0 out.
-    ridge = 1e-9 * jnp.trace(found.information, axis1=1, axis2=2)[:, None, None] * jnp.eye(3) + 1e-12 * jnp.eye(3)
+    ridge = 1e-12 * jnp.trace(found.information, axis1=1, axis2=2)[:, None, None] * jnp.eye(3) + 1e-12 * jnp.eye(3)
     solved = jnp.linalg.solve(found.information + ridge, found.score[..., None])[..., 0]
     return survival(q, jnp.sum(found.score * solved, axis=-1))
 

@@ -1,9 +1,8 @@
 """The scenes that one setting of gate and camera has to serve at once."""
 
 import dataclasses
-from typing import Literal
 
-from vcjax.simulation.scenarios import DynamicMotion, RobotMotion, Scenario, paper
+from vcjax.simulation.scenarios import DynamicMotion, DynamicSet, RobotMotion, Scenario, paper
 
 
 @dataclasses.dataclass(frozen=True)
@@ -11,13 +10,13 @@ class Scenes:
     """The paper's dynamic scenes: every motion of the dynamic features at every speed."""
 
     motions: tuple[DynamicMotion, ...] = ("lateral", "inverse_forward")
-    """How the six dynamic features move."""
+    """How the dynamic features move."""
     speeds_m_s: tuple[float, ...] = (1.0, 0.5, 0.25)
     """Their speeds, m/s."""
     robot: RobotMotion = "forward"
     """How the robot moves."""
-    dynamic_set: Literal["ahead", "near_path"] = "ahead"
-    """Which six features move."""
+    dynamic_set: DynamicSet = "ahead"
+    """Which features move: the six ahead of the robot, the six near its path, or a bus."""
     amplitude_m: float = 0.05
     """A of the oscillation, m (the paper: 0.05)."""
     frequency_hz: float = 3.0

@@ -152,5 +152,7 @@ def require_power(test: VelocityTest, power: float) -> None:
     Raises:
         ValueError: naming it and the false-alarm rate.
     """
-    if not float(test.false_alarm_rate) < power < 1:
-        raise ValueError(f"power={power}: give a number above the false-alarm rate {test.false_alarm_rate} and below 1.")
+    if not test.false_alarm_rate < power < 1:
+        raise ValueError(
+            f"power={power}: give a number above the false-alarm rate {test.false_alarm_rate} and below 1."
+        )
