@@ -1,6 +1,7 @@
 """The survey and the best oscillation: against one place after another, by brute force, and derivatives."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -8,18 +9,19 @@ import numpy as np
 import pytest
 
 from vcjax.simulation.scenarios import paper
-from vcjax.study.best_oscillation import best_oscillation, oscillation_cost
+from vcjax.study.best_oscillation import best_oscillation, cost_and_gradient
 from vcjax.study.detectability import VelocityTest, mover_power, power
 from vcjax.study.evaluate import stacked
 from vcjax.study.intervals import Interval
 from vcjax.study.survey import heading, predict_movers, survey
+from vcjax.study.sweep import replace_at
 
 NUM_FRAMES = 20
 SCENE = paper(num_frames=NUM_FRAMES)
 TEST = VelocityTest(false_alarm_rate=0.01)
 PLACES = np.array([[-4.0, 1.0, 1.0], [-2.0, 0.0, 0.0], [-7.5, 7.0, 1.0], [2.0, -3.0, 0.0]])
 OPTIONS = dict(amplitudes_m=(0.0, 0.1), headings_deg=(90.0, 180.0), speeds_m_s=(0.05, 0.4))
-of_power = jax.jit(power)
+of_power, of_movers = jax.jit(power), jax.jit(mover_power)
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +46,12 @@ def test_power_is_that_of_one_place_after_another(found):
 
 
 def test_the_smallest_speed_has_the_power_wanted(found):
-    """Between the speeds searched δ follows a power law only nearly: 0.9 is met within 0.02."""
+    """Between the speeds searched δ follows a power law only nearly: 0.9 is met within 0.05."""
     checked = 0
     for (i, n, j), speed in np.ndenumerate(found.smallest_m_s):
         if np.isfinite(speed):
             amplitude, angle = OPTIONS["amplitudes_m"][i], OPTIONS["headings_deg"][j]
-            assert at(amplitude, PLACES[n], angle, speed) == pytest.approx(0.9, abs=0.02)
+            assert at(amplitude, PLACES[n], angle, speed) == pytest.approx(0.9, abs=0.05)
             assert at(amplitude, PLACES[n], angle, 0.8 * speed) < 0.9
             checked += 1
     assert checked >= 8
@@ -65,20 +67,22 @@ def test_where_nothing_is_found_and_where_nothing_is_seen(found):
 def test_frames_needed_are_the_first_with_the_power_wanted():
     scenes = {
         f"A = {a}": paper(
-            dynamic="lateral", dynamic_places_m=[(-4, 0, 1), (-2, -2, 0)], num_frames=40, oscillation_amplitude_m=a
+            dynamic="lateral",
+            dynamic_places_m=[(-4.0, 0.0, 1.0), (-2.0, -2.0, 0.0)],
+            num_frames=40,
+            oscillation_amplitude_m=a,
         )
         for a in (0.0, 0.1)
     }
     test = dataclasses.replace(TEST, within_frames=15.0)
     predictions = predict_movers(scenes, test)
-    one = jax.jit(mover_power)
     for name, scene in scenes.items():
         prediction = predictions[name]
-        np.testing.assert_allclose(prediction.power, one(scene, test), rtol=1e-6)
-        np.testing.assert_allclose(prediction.power_of_all_frames, one(scene, TEST), rtol=1e-6)
+        np.testing.assert_allclose(prediction.power, of_movers(scene, test), rtol=1e-6)
+        np.testing.assert_allclose(prediction.power_of_all_frames, of_movers(scene, TEST), rtol=1e-6)
         for d, needed in enumerate(prediction.frames_needed):
             before, after = (
-                float(one(scene, dataclasses.replace(TEST, within_frames=n))[d]) for n in (needed - 1, needed)
+                float(of_movers(scene, dataclasses.replace(TEST, within_frames=n))[d]) for n in (needed - 1, needed)
             )
             assert before < 0.9 <= after
     hopeless = predict_movers({"a": dataclasses.replace(scene, pixel_std_px=np.float64(1e6))}, test)["a"]
@@ -89,34 +93,45 @@ def movers(**options):
     return paper(dynamic="inverse_forward", dynamic_speed_m_s=0.5, num_frames=NUM_FRAMES, **options)
 
 
-SCENES = {"ahead": movers(dynamic_places_m=[(-4, -2, 0)]), "near": movers(dynamic_places_m=[(-2, 2, 1)])}
+SCENES = {"ahead": movers(dynamic_places_m=[(-4.0, -2.0, 0.0)]), "near": movers(dynamic_places_m=[(-2.0, 2.0, 1.0)])}
+
+
+INTERVALS = {
+    "scenario.oscillation.amplitude_m": Interval(0.0, 0.08),
+    "scenario.oscillation.frequency_hz": Interval(0.5, 4.5),
+}
+
+
+def cost(part):
+    """The cost with its parts, and its gradient."""
+    return cost_and_gradient(stacked(SCENES), TEST, 0.05, tuple(INTERVALS.values()), jnp.asarray(part))
 
 
 def test_the_gradient_of_the_cost_is_a_finite_difference():
-    scenes = stacked(SCENES)
-    cost = jax.jit(lambda x: oscillation_cost(scenes, TEST, 0.02, x[0], x[1])[0])
-    x, h = jnp.array([0.05, 2.3]), 1e-5
-    differences = [float(cost(x + h * e) - cost(x - h * e)) / (2 * h) for e in jnp.eye(2)]
-    gradient = jax.jit(jax.grad(cost))(x)
+    x, h = np.array([0.6, 0.45]), 1e-5
+    differences = [float(cost(x + h * e)[0][0] - cost(x - h * e)[0][0]) / (2 * h) for e in np.eye(2)]
+    gradient = cost(x)[1]
     np.testing.assert_allclose(gradient, differences, rtol=1e-6)
-    assert gradient[0] < -1 and abs(gradient[1]) > 1e-4
+    assert gradient[0] < -0.1 and abs(gradient[1]) > 1e-4
 
 
 def test_the_best_oscillation_is_at_least_as_good_as_a_grid():
-    intervals = {
-        "scenario.oscillation.amplitude_m": Interval(0.0, 0.08),
-        "scenario.oscillation.frequency_hz": Interval(0.5, 4.5),
-    }
-    best = best_oscillation(SCENES, TEST, price=0.05, intervals=intervals, num_starts=4)
-    scenes = stacked(SCENES)
-    cost = jax.jit(jax.vmap(lambda A, f: jnp.stack(oscillation_cost(scenes, TEST, 0.05, A, f))))
-    A, f = (a.ravel() for a in np.meshgrid(np.linspace(0, 0.08, 9), np.linspace(0.5, 4.5, 9)))
-    values = np.asarray(cost(jnp.asarray(A), jnp.asarray(f)))
-    assert best.cost <= values[:, 0].min() + 1e-6
+    best = best_oscillation(SCENES, TEST, price=0.05, intervals=INTERVALS, num_starts=4)
+    values = [float(cost(part)[0][0]) for part in itertools.product(np.linspace(0, 1, 9), repeat=2)]
+    assert best.cost <= min(values) + 1e-6
     assert 0 < best.amplitude_m <= 0.08 and 0.5 <= best.frequency_hz <= 4.5
     motion = 0.5 * (2 * np.pi * best.frequency_hz * best.amplitude_m) ** 2
     np.testing.assert_allclose(best.camera_motion_m2_s2, motion, rtol=1e-9)
     np.testing.assert_allclose(best.cost, best.missed + 0.05 * motion, rtol=1e-9)
+    missed = [
+        1 - of_movers(replace_at(scene, _oscillation(best.amplitude_m, best.frequency_hz)), TEST)
+        for scene in SCENES.values()
+    ]
+    np.testing.assert_allclose(best.missed, np.mean(missed), rtol=1e-9)
+
+
+def _oscillation(A, f):
+    return {"oscillation.amplitude_m": A, "oscillation.frequency_hz": f}
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -74,24 +74,38 @@ def best_oscillation(
     scenes = stacked(scenarios)
     ends = tuple(intervals[path] for path in OSCILLATION)
 
-    @jax.jit
-    def cost(part):
-        values = [interval.at(p) for interval, p in zip(ends, part, strict=True)]
-        return oscillation_cost(scenes, test, price, *values)[0]
-
-    with_gradient = jax.jit(jax.value_and_grad(cost))
-
     def objective(part: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = with_gradient(part)
+        (value, _), gradient = cost_and_gradient(scenes, test, price, ends, jnp.asarray(part))
         return float(value), np.asarray(gradient, float)
 
     starts = qmc.Halton(len(ends), scramble=False).random(num_starts + 1)[1:]  # its first point is a corner
-    # The ends of the intervals may be those of what makes sense, f below half the frame rate.
     found = [minimize(objective, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * 2) for start in starts]
     best = min(found, key=lambda result: result.fun)
+    (value, (missed, motion)), _ = cost_and_gradient(scenes, test, price, ends, jnp.asarray(best.x))
     A, f = (float(interval.at(p)) for interval, p in zip(ends, best.x, strict=True))
-    value, missed, motion = (float(v) for v in oscillation_cost(scenes, test, price, A, f))
-    return Oscillating(A, f, missed, motion, value)
+    return Oscillating(A, f, float(missed), float(motion), float(value))
+
+
+@jax.jit
+def cost_and_gradient(
+    scenes: Scenario,
+    test: VelocityTest,
+    price: float | Float[Array, ""],
+    ends: tuple[Interval, Interval],
+    part: Float[Array, "2"],
+):
+    """The cost at a part of each interval, from 0 to 1, with its parts, and its gradient by these.
+
+    Returns: ((cost, (missed, camera motion)), gradient).
+    """
+
+    def cost(part):
+        total, missed, motion = oscillation_cost(
+            scenes, test, price, *(i.at(p) for i, p in zip(ends, part, strict=True))
+        )
+        return total, (missed, motion)
+
+    return jax.value_and_grad(cost, has_aux=True)(part)
 
 
 def oscillation_cost(

@@ -25,11 +25,11 @@ class Survey(NamedTuple):
     power: Float[np.ndarray, "A N H S"]
     """Power of the test."""
     smallest_m_s: Float[np.ndarray, "A N H"]
-    """Smallest speed found with the power wanted, m/s; infinite where none of `SEARCHED_M_S` is, NaN where a feature
-    that stands there is never in view."""
+    """Smallest speed found with the power wanted, m/s, interpolated in `SEARCHED_M_S`; infinite where none of these is
+    found, NaN where a feature that stands there is never in view."""
 
 
-def heading(angle_deg: float | Float[Array, "*n"]) -> Float[Array, "*n 3"]:
+def heading(angle_deg: float | Float[Array | np.ndarray, "*n"]) -> Float[Array, "*n 3"]:
     """The horizontal unit vector at an angle from x (forward) to y (left), deg. Derivative exact."""
     angle = jnp.deg2rad(jnp.asarray(angle_deg, float))
     return jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)], axis=-1)
