@@ -13,7 +13,7 @@ from vcjax.report.detectability import write_detectability
 from vcjax.simulation.scenarios import DynamicSet, RobotMotion, paper
 from vcjax.simulation.simulate import true_path
 from vcjax.storage import check_writable
-from vcjax.study.best_oscillation import best_oscillation
+from vcjax.study.best_oscillation import best_oscillation, require_price
 from vcjax.study.detectability import VelocityTest
 from vcjax.study.scenes import Scenes
 from vcjax.study.survey import predict_movers, require_power, survey
@@ -59,6 +59,7 @@ class Detectability:
     def __call__(self, console: Console) -> None:
         """Predict, draw, report."""
         require_power(self.test, self.power)
+        require_price(self.price)
         if not 0.05 <= self.spacing_m <= 8:
             raise ValueError(f"--spacing-m {self.spacing_m:g}: give a distance from 0.05 to 8 m.")
         check_writable(self.out / "detectability.json")

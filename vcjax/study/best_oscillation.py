@@ -63,8 +63,7 @@ def best_oscillation(
     Raises:
         ValueError: for arguments that make no sense.
     """
-    if not np.isfinite(price) or price < 0:
-        raise ValueError(f"best_oscillation(price={price}): a price is at least 0.")
+    require_price(price)
     if not isinstance(num_starts, int | np.integer) or num_starts < 1:
         raise ValueError(f"best_oscillation(num_starts={num_starts!r}): give a whole number of at least 1.")
     if set(intervals) != set(OSCILLATION):
@@ -106,6 +105,16 @@ def cost_and_gradient(
         return total, (missed, motion)
 
     return jax.value_and_grad(cost, has_aux=True)(part)
+
+
+def require_price(price: float) -> None:
+    """Refuse what is no price.
+
+    Raises:
+        ValueError: for a negative number, or none.
+    """
+    if not np.isfinite(price) or price < 0:
+        raise ValueError(f"best_oscillation(price={price}): a price is at least 0.")
 
 
 def oscillation_cost(

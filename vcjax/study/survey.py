@@ -78,15 +78,17 @@ def _survey(scenario: Scenario, test: VelocityTest, places, directions, speeds, 
     q = quantile(test.false_alarm_rate)
     needed, searched = noncentrality(wanted, q), jnp.asarray(SEARCHED_M_S)
 
-    def delta(place, direction, speed):
-        return speed**2 * (direction @ information(scenario, test, place, speed * direction) @ direction)
+    # All speeds in one, at rest too: so the kernel is compiled once.
+    every = jnp.concatenate([jnp.zeros(1), searched, speeds])
+
+    def of_mover(place, direction, speed):
+        C = information(scenario, test, place, speed * direction)
+        return speed**2 * (direction @ C @ direction), jnp.trace(C) > 0
 
     def at_place(place):
-        deltas = jax.vmap(lambda u: jax.vmap(lambda s: delta(place, u, s))(speeds))(directions)
-        of_search = jax.vmap(lambda u: jax.vmap(lambda s: delta(place, u, s))(searched))(directions)
-        smallest = jax.vmap(lambda d: _crossing(searched, d, needed))(of_search)
-        is_seen = jnp.trace(information(scenario, test, place, jnp.zeros(3))) > 0
-        return survival(q, deltas), jnp.where(is_seen, smallest, jnp.nan)
+        deltas, has_some = jax.vmap(lambda u: jax.vmap(lambda s: of_mover(place, u, s))(every))(directions)
+        smallest = jax.vmap(lambda d: _crossing(searched, d, needed))(deltas[:, 1 : 1 + len(searched)])
+        return survival(q, deltas[:, 1 + len(searched) :]), jnp.where(has_some[:, 0], smallest, jnp.nan)
 
     return jax.lax.map(at_place, places, batch_size=_PLACES_PER_BATCH)
 
