@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
+from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
@@ -206,8 +206,9 @@ def _maps(found: Detectability, values: np.ndarray, title: str, label: str, **co
     half = (found.side_m[1] - found.side_m[0]) / 2
     edges = np.append(found.side_m - half, found.side_m[-1] + half)
     image = None
-    for i, j in np.ndindex(rows, columns):
-        axes, one = panels[i, j], values[i, :, j].reshape(side, side)
+    for number, axes in enumerate(panels.flat):
+        i, j = divmod(number, columns)
+        one = values[i, :, j].reshape(side, side)
         axes.set_facecolor(_UNSEEN)
         axes.pcolormesh(edges, edges, np.where(np.isinf(one), 1.0, np.nan).T, cmap=_plain(_NEVER), rasterized=True)
         image = axes.pcolormesh(edges, edges, np.where(np.isinf(one), np.nan, one).T, rasterized=True, **colours)
@@ -226,8 +227,8 @@ def _maps(found: Detectability, values: np.ndarray, title: str, label: str, **co
     return figure
 
 
-def _plain(colour: str) -> matplotlib.colors.ListedColormap:
-    return matplotlib.colors.ListedColormap([colour])
+def _plain(colour: str) -> ListedColormap:
+    return ListedColormap([colour])
 
 
 def _draw_path(axes: Axes, found: Detectability) -> None:
