@@ -111,15 +111,26 @@ def test_without_a_blacklist_a_deleted_feature_may_come_back(recording):
 
 def test_the_blacklist_keeps_the_newest(recording):
     state, _ = start(SMALL, head(recording, 1), KEY)
-    state = eqx.tree_at(lambda s: s.blacklist, state, jnp.full(3, -1))
+    state = eqx.tree_at(lambda s: (s.blacklist, s.blacklist_left), state, (jnp.full(3, -1), jnp.zeros(3)))
     held = ids(state.track_id)
     slots = jnp.arange(len(state.track_id))
     for slot in (4, 1, 7, 2):
         is_banned = slots == slot
-        state = landmark_map.delete(landmark_map.ban(state, is_banned), is_banned)
+        state = landmark_map.delete(landmark_map.ban(SMALL, state, is_banned), is_banned)
     assert state.blacklist.tolist() == [held[2], held[7], held[1]]
-    nobody = landmark_map.ban(state, slots < 0)
+    nobody = landmark_map.ban(SMALL, state, slots < 0)
     assert nobody.blacklist.tolist() == state.blacklist.tolist()
+
+
+def test_the_blacklist_keeps_a_feature_for_a_time(recording):
+    config = dataclasses.replace(SMALL, blacklist_frames=2)
+    state, _ = start(SMALL, head(recording, 1), KEY)
+    state = eqx.tree_at(lambda s: (s.blacklist, s.blacklist_left), state, (jnp.full(3, -1), jnp.zeros(3)))
+    held, slots, banned = ids(state.track_id), jnp.arange(len(state.track_id)), []
+    for slot in (4, 1, -1, -1, -1):
+        state = landmark_map.ban(config, state, slots == slot)
+        banned.append(ids(state.blacklist))
+    assert banned == [[held[4]], [held[1], held[4]], [held[1]], [], []]
 
 
 def test_births_go_by_the_lowest_id(recording):
