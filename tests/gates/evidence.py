@@ -60,7 +60,9 @@ def random_record(seed, num_frames=40, num_slots=5, num_candidates=3) -> dict:
     z = 2 * rng.normal(size=(*shape, 2))
     re1 = np.einsum("tka,tkab,tkb->tk", z, np.linalg.inv(S), z)
     gain = np.where(is_corrected[..., None, None], 0.03 * rng.normal(size=(*shape, 7, 2)), 0.0)
-    numbers = dict(innovation=z, innovation_cov=S, H=5 * rng.normal(size=(*shape, 2, 7)), re1=re1, dynamic_margin=re1 - 9)
+    numbers = dict(
+        innovation=z, innovation_cov=S, H=5 * rng.normal(size=(*shape, 2, 7)), re1=re1, dynamic_margin=re1 - 9
+    )
     is_found = is_searched & is_measured
     numbers = {k: np.where(is_found.reshape(*shape, *(1,) * (v.ndim - 2)), v, np.nan) for k, v in numbers.items()}
     fields = dict(

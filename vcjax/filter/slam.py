@@ -79,9 +79,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         jnp.where(is_measured, innovation.is_visible, prediction.is_visible[slot])
     )
     is_watched = state.is_mapped & ~is_dynamic
-    evidence = evidence_of(
-        submap, outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, frame.time_step_s
-    )
+    evidence = evidence_of(submap, outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, frame.time_step_s)
     detector, margin = config.detector.observe(_of_mapped(config, state), evidence)
     margin = jnp.where(is_watched, margin, jnp.nan)
     is_flagged = margin > 0

@@ -154,11 +154,27 @@ class Evidence(eqx.Module):
         """Searched and found: the candidates with an innovation."""
         return self.is_searched & self.is_measured
 
+    def found(self, *values: Array) -> tuple[Array, ...]:
+        """Arrays of the candidates (K, …), of those not found replaced by numbers without effect: I for a matrix that
+        is a covariance, else 0. What means nothing, NaN included, then leaves derivatives finite."""
+        instead = (jnp.eye(2, dtype=v.dtype) if v is self.innovation_cov else jnp.zeros((), v.dtype) for v in values)
+        return tuple(jnp.where(_like(self.is_found, v), v, i) for v, i in zip(values, instead, strict=True))
 
-def at_slots(evidence: Evidence, total: Array, values: Array, counts: Bool[Array, " K"]) -> Array:
-    """A per-slot array (L, …) with values of the candidates (K, …) added at their slots, of those that count."""
-    counts = counts.reshape(-1, *(1,) * (values.ndim - 1))
-    return total.at[evidence.slot].add(jnp.where(counts, values, 0).astype(total.dtype))
+
+def add_at_slots(evidence: Evidence, total: Array, values: Array) -> Array:
+    """A per-slot array (L, …) with values (K, …) of the candidates that were found added at their slots."""
+    return total.at[evidence.slot].add(jnp.where(_like(evidence.is_found, values), values, 0).astype(total.dtype))
+
+
+def set_at_slots(evidence: Evidence, before: Array, values: Array) -> Array:
+    """A per-slot array (L, …) with values (K, …) of the candidates that were found in place of what was there."""
+    values = jnp.where(_like(evidence.is_found, values), values, before[evidence.slot])
+    return before.at[evidence.slot].set(values)
+
+
+def _like(mask: Bool[Array, " K"], values: Array) -> Array:
+    """A mask with as many axes as what it masks."""
+    return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
 
 class AbstractDetector(eqx.Module):

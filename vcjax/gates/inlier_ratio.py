@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vcjax.fields import number, require
-from vcjax.gates.gate import AbstractDetector, Evidence, at_slots
+from vcjax.gates.gate import AbstractDetector, Evidence
 
 
 class Counts(NamedTuple):
@@ -50,7 +50,7 @@ class InlierRatio(AbstractDetector):
         """Count this frame's candidates and compare the ratios with their bounds."""
 
         def count(total, happened):
-            return at_slots(evidence, total, jnp.ones(happened.shape), happened & evidence.is_searched)
+            return total.at[evidence.slot].add((happened & evidence.is_searched).astype(total.dtype))
 
         state = Counts(
             count(state.searched, evidence.is_searched),

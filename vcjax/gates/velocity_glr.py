@@ -24,7 +24,10 @@ ratio of moving against static is known in closed form (Robbins 1970),
 
 and a static landmark's is a martingale of mean one, so that it ever exceeds 1/α with a probability of at most α (Ville's
 inequality): for a false-alarm rate α per track the threshold is 2 ln(1/α) + ln det(I + σ² C), which grows with what is
-known. It needs no number of frames, and is cautious: of the rate asked for, tracks of some hundred frames use up a part.
+known. It needs no number of frames, and
+is cautious: of the rate asked for, 60 innovations use up a quarter (0.25 % of tracks for α = 1 %, 4 % for 10 %; measured
+on 4000 linear ones, σ = 1 m/s). A fixed threshold flags fewer at first and more in the end: of the same tracks 9.1 % ever pass 12,
+1.8 % pass 16 and 0.28 % pass 20, some 10 to 20 times as many as in a single test.
 
 Which innovations: those of all measured candidates, or only of those that corrected the state. White are only the
 latter: one that is left out leaves its error in the state, to be met again in the next. But the gate leaves out what is
@@ -47,7 +50,7 @@ from jaxtyping import Array, Float
 
 from vcjax.ekf import whiten, whitener
 from vcjax.fields import is_concrete, number, require, require_choice
-from vcjax.gates.gate import AbstractDetector, Evidence, at_slots
+from vcjax.gates.gate import AbstractDetector, Evidence, add_at_slots
 
 Innovations = Literal["measured", "corrected"]
 INNOVATIONS = ("measured", "corrected")
@@ -78,7 +81,7 @@ class VelocityGLR(AbstractDetector):
     """Share of the static tracks that are ever flagged, at most; in (0, 1)."""
     threshold: float | None = eqx.field(converter=number, default=None)
     """A χ²₃ value instead, the same in all frames; positive."""
-    velocity_std_m_s: float = eqx.field(converter=number, default=1.0)
+    velocity_std_m_s: float = eqx.field(converter=number, default=0.5)
     """σ of the weak prior on each component of the velocity, m/s; positive."""
     forgetting: float = eqx.field(converter=number, default=1.0)
     """By how much B, d and C shrink in each frame, in (0, 1]; 1: a constant velocity since birth; below, one held over
@@ -106,28 +109,24 @@ class VelocityGLR(AbstractDetector):
 
     def observe(self, state: Motion, evidence: Evidence) -> tuple[Motion, Float[Array, " L"]]:
         """The recursion above, and by how much the statistic passes its threshold; NaN where nothing was seen yet."""
-        counts = evidence.is_found
-        f, weight = self.forgetting, jnp.where(counts, evidence.weight, 0.0)
-        if self.innovations == "measured":
-            weight = counts.astype(weight.dtype)
+        z, S, H, K, weight = evidence.found(
+            evidence.innovation, evidence.innovation_cov, evidence.H, evidence.gain, evidence.weight
+        )
+        weight = jnp.ones_like(weight) if self.innovations == "measured" else weight
+        W = jax.vmap(whitener)(S)
+        z = jax.vmap(whiten)(W, z)
 
-        def counted(values, instead=0.0):
-            return jnp.where(counts.reshape(-1, *(1,) * (values.ndim - 1)), values, instead)
-
-        H, K = counted(evidence.H), counted(evidence.gain)
-        W = jax.vmap(whitener)(counted(evidence.innovation_cov, jnp.eye(2)))
-        z = jax.vmap(whiten)(W, counted(evidence.innovation))
-
+        f = self.forgetting
         B = f * state.B
         B = B.at[:, jnp.arange(3), jnp.arange(3)].add(evidence.time_step_s)
         G = H @ B[evidence.slot]
         white_G = jax.vmap(whiten)(W, G)
         information = weight[:, None, None] * (white_G.mT @ white_G)
         state = Motion(
-            B=at_slots(evidence, B, -(K @ G), counts),
-            d=at_slots(evidence, f * state.d, weight[:, None] * jnp.sum(white_G * z[..., None], axis=1), counts),
-            C=at_slots(evidence, f * state.C, information, counts),
-            D=at_slots(evidence, f**2 * state.D, weight[:, None, None] * information, counts),
+            B=add_at_slots(evidence, B, -(K @ G)),
+            d=add_at_slots(evidence, f * state.d, weight[:, None] * jnp.sum(white_G * z[..., None], axis=1)),
+            C=add_at_slots(evidence, f * state.C, information),
+            D=add_at_slots(evidence, f**2 * state.D, weight[:, None, None] * information),
         )
         is_known = jnp.trace(state.C, axis1=1, axis2=2) > 0
         return state, jnp.where(is_known, self.margin(state), np.nan)
