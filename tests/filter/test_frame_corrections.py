@@ -186,7 +186,7 @@ def own_rows(gain, slot):
 
 
 def test_gains_are_those_of_dense_updates_one_after_another(problem):
-    """Correction j sees its innovation at prediction less H_j A, with A the gain of all before: A ← A + K_j (e_j - H_j A)."""
+    """Correction j sees its innovation at prediction less H_j A, A the gain so far: A ← A + K_j (e_j - H_j A)."""
     state, slot, uv_px = problem
     is_measured = np.arange(K) % 4 != 3
     now, A = state, np.zeros((VEHICLE + SLOT * state.track_id.shape[0], 2 * K))

@@ -85,7 +85,7 @@ def test_a_ratio_exactly_at_its_bound_is_not_flagged(found):
 
 
 def test_the_margin_is_the_deviance_of_a_binomial_share():
-    """Twice the log of the likelihood ratio between the share found and its bound, by scipy, with the verdict's sign."""
+    """Twice the log likelihood ratio of the share found and its bound, by scipy, with the verdict's sign."""
     nobody = np.array([False] * 3)
     nothing_happens = evidence([0, 1, 2], 3, is_searched=nobody, is_measured=nobody, is_corrected=nobody)
     found, fitted = np.array([40, 40, 3]), np.array([30, 12, 3])

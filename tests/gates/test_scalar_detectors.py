@@ -139,7 +139,7 @@ def test_cusum_flags_no_more_static_tracks_than_its_bound():
     assert np.exp(-4.0 * theta) == pytest.approx(1 - 2 * theta, rel=1e-3)
     for limit in (12.0, 15.0):
         bound = num_frames * np.exp(-theta * limit)
-        assert bound / 10 < share_ever_flagged(Cusum(limit=limit)) < bound
+        assert bound / 20 < share_ever_flagged(Cusum(limit=limit)) < bound
 
 
 def test_windowed_nis_is_chi_squared():

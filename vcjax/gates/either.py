@@ -1,6 +1,5 @@
 """Two detectors as one: a landmark is deleted when either flags it."""
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
@@ -28,9 +27,7 @@ class Either(AbstractDetector):
         """Both states."""
         return self.first.born(), self.second.born()
 
-    def observe(
-        self, state: tuple[PyTree, PyTree], evidence: Evidence
-    ) -> tuple[tuple[PyTree, PyTree], Float[Array, " L"]]:
+    def observe(self, state: PyTree, evidence: Evidence) -> tuple[PyTree, Float[Array, " L"]]:
         """Both detectors' new states and the larger margin."""
         first, first_margin = self.first.observe(state[0], evidence)
         second, second_margin = self.second.observe(state[1], evidence)

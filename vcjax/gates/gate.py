@@ -155,8 +155,10 @@ class Evidence(eqx.Module):
         return self.is_searched & self.is_measured
 
     def found(self, *values: Array) -> tuple[Array, ...]:
-        """Arrays of the candidates (K, …), of those not found replaced by numbers without effect: I for a matrix that
-        is a covariance, else 0. What means nothing, NaN included, then leaves derivatives finite."""
+        """Some of the arrays above (K, …), with 0 for candidates that were not found, I for their covariance.
+
+        What means nothing, NaN included, then has no effect on what is computed, and leaves derivatives finite.
+        """
         instead = (jnp.eye(2, dtype=v.dtype) if v is self.innovation_cov else jnp.zeros((), v.dtype) for v in values)
         return tuple(jnp.where(_like(self.is_found, v), v, i) for v, i in zip(values, instead, strict=True))
 
