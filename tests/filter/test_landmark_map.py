@@ -11,7 +11,9 @@ from filter_runs import CAPACITY, filtered, frame_of, head, ids, joint, recorded
 
 from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.features import Block, observe
 from vcjax.gates.virtual_correction import VirtualCorrection
+from vcjax.models.camera import Camera
 
 VC = FilterConfig(max_landmarks=CAPACITY, retire=False)
 # Many features are called dynamic without being so.
@@ -131,6 +133,16 @@ def test_the_blacklist_keeps_a_feature_for_a_time(recording):
         state = landmark_map.ban(config, state, slots == slot)
         banned.append(ids(state.blacklist))
     assert banned == [[held[4]], [held[1], held[4]], [held[1]], [], []]
+
+
+@pytest.mark.parametrize(("rho", "is_ahead"), [(0.1, True), (-0.001, True), (-0.001, False)])
+def test_a_negative_inverse_depth_is_behind_the_camera_or_beyond_infinity(rho, is_ahead):
+    pose, mount = np.array([0.0, 0, 0, 1, 0, 0, 0]), np.array([0.0, 0, 0.6, 0.5, -0.5, 0.5, -0.5])
+    landmark = np.array([0.1, 0.2, 0.6, 1.0 if is_ahead else -1.0, 0.1, 0.0, rho])
+    block = Block(jnp.concatenate([pose, mount]), jnp.asarray(landmark), jnp.eye(7))
+    for config, is_seen in ((VC, is_ahead == (rho > 0)), (FilterConfig(see_beyond_infinity=True), is_ahead)):
+        observation = observe(config, Camera(), block)
+        assert bool(observation.is_visible) == bool(observation.is_near) == is_seen
 
 
 def test_births_go_by_the_lowest_id(recording):
