@@ -81,7 +81,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     is_watched = state.is_mapped & ~is_dynamic
     evidence = evidence_of(submap, outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, frame.time_step_s)
     detector, margin = config.detector.observe(_of_mapped(config, state), evidence)
-    margin = jnp.where(is_watched, margin, jnp.nan)
+    margin = jnp.where(is_watched, margin, jnp.nan).astype(state.P_vv.dtype)
     is_flagged = margin > 0
     state = eqx.tree_at(lambda s: s.detector, state, detector)
 
