@@ -80,6 +80,8 @@ def fake_runs(cell: Cell | None = None, num_seeds: int = 4, num_frames: int = 20
                 np.where(dynamic_deletions + inconsistent_deletions > 0, num_frames // 2, 0),
             ),
             "dynamic_margin": (("seed", "feature"), dynamic_deletions - 0.5),
+            "detector_margin": (("seed", "feature"), inconsistent_deletions - 0.5),
+            "detector_auc": ("seed", np.full(num_seeds, 0.5 if is_moving.any() else np.nan)),
             "detection_auc": ("seed", np.full(num_seeds, 0.75 if is_moving.any() else np.nan)),
             "is_moving": ("feature", is_moving),
             "is_finite": ("seed", np.ones(num_seeds, bool)),

@@ -11,6 +11,7 @@ from told import assert_one_line, said
 import vcjax as vc
 from vcjax.cli import main
 from vcjax.study import monte_carlo as monte_carlo_module
+from vcjax.study.reproduce import DETECTORS
 from vcjax.study.results import describe
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
@@ -37,6 +38,20 @@ def test_gate_is_the_last_one_named(options, gate, th1, tmp_path, monkeypatch, c
     assert main(["run", *options]) == 0
     assert type(seen[0].gate).__name__ == gate and seen[0].gate.th1 == th1
     assert len(list(tmp_path.rglob("*"))) >= 1
+
+
+@pytest.mark.parametrize("name", [None, *DETECTORS])
+def test_detector_is_the_one_named_with_options_of_its_own(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    monkeypatch.setattr(
+        "vcjax.commands.run.monte_carlo", lambda _, config, **__: seen.append(config) or fake_runs(num_seeds=2)
+    )
+    own = {"velocity_glr": ["--threshold", "20", "--innovations", "corrected"], "cusum": ["--drift", "3"]}
+    named = [] if name is None else ["--detector", name]
+    assert main(["run", "--gate", "RE", *named, *own.get(name, [])]) == 0
+    expected = {"velocity_glr": vc.VelocityGLR(threshold=20, innovations="corrected"), "cusum": vc.Cusum(3.0)}
+    assert describe(seen[0].detector) == describe(expected.get(name, DETECTORS[name or "inlier_ratio"]()))
 
 
 def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
@@ -121,6 +136,10 @@ def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsy
         ("run --gate RE --th2 3", ["--th2", "--th1"]),
         ("run --th1 -1", ["VirtualCorrection(th1=-1.0)", "is positive"]),
         ("run --gate RE --th1 0", ["ReprojectionError(th1=0.0)", "is positive"]),
+        ("run --detector XX", ["'XX'", "--detector", "velocity_glr"]),
+        ("run --detector velocity_glr --false-alarm-rate 2", ["VelocityGLR(false_alarm_rate=2.0)", "(0, 1)"]),
+        ("run --detector velocity_glr --forgetting 0.9", ["VelocityGLR(forgetting=0.9)", "give a threshold"]),
+        ("run --blacklist-frames -1", ["FilterConfig(blacklist_frames=-1.0)", "infinity: for good"]),
         ("run --th2 nan", ["VirtualCorrection(th2=nan)"]),
         ("run --oscillation-frequency-hz 5", ["frequency_hz=5.0", "half the frame rate of 10.0 Hz", "lower frequency"]),
         ("run --oscillation-amplitude-m -0.1", ["amplitude_m=-0.1"]),

@@ -13,9 +13,15 @@ from vcjax.filter.slam import run as run
 from vcjax.filter.slam import start as start
 from vcjax.filter.slam import step as step
 from vcjax.filter.state import FilterState as FilterState
+from vcjax.gates.cusum import Cusum as Cusum
+from vcjax.gates.either import Either as Either
+from vcjax.gates.immediate import Immediate as Immediate
 from vcjax.gates.inlier_ratio import InlierRatio as InlierRatio
 from vcjax.gates.reprojection import ReprojectionError as ReprojectionError
+from vcjax.gates.velocity_glr import VelocityGLR as VelocityGLR
+from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio as VelocityLikelihoodRatio
 from vcjax.gates.virtual_correction import VirtualCorrection as VirtualCorrection
+from vcjax.gates.windowed_nis import WindowedNIS as WindowedNIS
 from vcjax.models.camera import Camera as Camera
 from vcjax.models.motion import Oscillation as Oscillation
 from vcjax.recording import Recording as Recording

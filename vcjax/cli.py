@@ -4,7 +4,7 @@ import contextlib
 import io
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated
 
 import jax
@@ -19,7 +19,7 @@ from vcjax.commands.run import Run
 from vcjax.commands.sweep import Sweep
 from vcjax.commands.tune import Tune
 from vcjax.filter.config import FilterConfig
-from vcjax.study.reproduce import GATES
+from vcjax.study.reproduce import DETECTORS, GATES
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -53,9 +53,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str]) -> Reproduce | Report | Run | Tune | Sweep | Detectability | Bench:
-    """The command with its options. The gate's own options depend on the gate, so that is looked up first."""
-    gate = _gate_name(arguments)
-    default = Run(scenario=tyro.MISSING, config=FilterConfig(gate=GATES[gate]()))
+    """The command with its options. Gate and detector have options of their own, so they are looked up first."""
+    gate = _named(arguments, "--gate", GATES, "VC")
+    detector = _named(arguments, "--detector", DETECTORS, "inlier_ratio")
+    config = FilterConfig(gate=GATES[gate](), detector=DETECTORS[detector]())
+    default = Run(scenario=tyro.MISSING, config=config)
     union = (
         Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
         | Annotated[Report, tyro.conf.subcommand("report")]
@@ -96,10 +98,9 @@ def _refusal(stop: BaseException) -> ValueError | None:
     return None
 
 
-def _gate_name(arguments: list[str]) -> str:
-    """The last value of `--gate`; the default where there is none, or one that the parser will refuse."""
-    gate = "VC"
+def _named(arguments: list[str], choice: str, known: Collection[str], default: str) -> str:
+    """The last value of an option; the default where there is none, or one that the parser will refuse."""
     for option, value in zip(arguments, [*arguments, ""][1:], strict=True):
-        name = value if option == "--gate" else option.removeprefix("--gate=") if option.startswith("--gate=") else ""
-        gate = name if name in GATES else gate
-    return gate
+        name = value if option == choice else option[len(choice) + 1 :] if option.startswith(f"{choice}=") else ""
+        default = name if name in known else default
+    return default

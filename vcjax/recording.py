@@ -25,6 +25,8 @@ COVARIANCE_TOLERANCE = 1e-5
 class Frame(eqx.Module):
     """One frame of a recording: the odometry that led to it and the features seen in it."""
 
+    time_step_s: Float[Array, ""]
+    """Time since the frame before, s; 0 in the first."""
     odometry: Float[Array, "6"]
     odometry_cov: Float[Array, "6 6"]
     sensor_shift_m: Float[Array, "3"]
@@ -71,6 +73,11 @@ class Recording(eqx.Module):
     def num_frames(self) -> int:
         """T, the number of frames."""
         return self.odometry.shape[-2]
+
+    @property
+    def time_step_s(self) -> Float[Array, " T"]:
+        """Time since the frame before, s; 0 in the first."""
+        return jnp.diff(jnp.asarray(self.time_s), prepend=jnp.asarray(self.time_s)[:1])
 
     def frame(self, t: int | Int[Array, ""]) -> Frame:
         """Frame t, 0 ≤ t < T."""

@@ -11,7 +11,9 @@ from filter_runs import CAPACITY, filtered, frame_of, head, ids, joint, recorded
 
 from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.features import Block, observe
 from vcjax.gates.virtual_correction import VirtualCorrection
+from vcjax.models.camera import Camera
 
 VC = FilterConfig(max_landmarks=CAPACITY, retire=False)
 # Many features are called dynamic without being so.
@@ -111,15 +113,36 @@ def test_without_a_blacklist_a_deleted_feature_may_come_back(recording):
 
 def test_the_blacklist_keeps_the_newest(recording):
     state, _ = start(SMALL, head(recording, 1), KEY)
-    state = eqx.tree_at(lambda s: s.blacklist, state, jnp.full(3, -1))
+    state = eqx.tree_at(lambda s: (s.blacklist, s.blacklist_left), state, (jnp.full(3, -1), jnp.zeros(3)))
     held = ids(state.track_id)
     slots = jnp.arange(len(state.track_id))
     for slot in (4, 1, 7, 2):
         is_banned = slots == slot
-        state = landmark_map.delete(landmark_map.ban(state, is_banned), is_banned)
+        state = landmark_map.delete(landmark_map.ban(SMALL, state, is_banned), is_banned)
     assert state.blacklist.tolist() == [held[2], held[7], held[1]]
-    nobody = landmark_map.ban(state, slots < 0)
+    nobody = landmark_map.ban(SMALL, state, slots < 0)
     assert nobody.blacklist.tolist() == state.blacklist.tolist()
+
+
+def test_the_blacklist_keeps_a_feature_for_a_time(recording):
+    config = dataclasses.replace(SMALL, blacklist_frames=2)
+    state, _ = start(SMALL, head(recording, 1), KEY)
+    state = eqx.tree_at(lambda s: (s.blacklist, s.blacklist_left), state, (jnp.full(3, -1), jnp.zeros(3)))
+    held, slots, banned = ids(state.track_id), jnp.arange(len(state.track_id)), []
+    for slot in (4, 1, -1, -1, -1):
+        state = landmark_map.ban(config, state, slots == slot)
+        banned.append(ids(state.blacklist))
+    assert banned == [[held[4]], [held[1], held[4]], [held[1]], [], []]
+
+
+@pytest.mark.parametrize(("rho", "is_ahead"), [(0.1, True), (-0.001, True), (-0.001, False)])
+def test_a_negative_inverse_depth_is_behind_the_camera_or_beyond_infinity(rho, is_ahead):
+    pose, mount = np.array([0.0, 0, 0, 1, 0, 0, 0]), np.array([0.0, 0, 0.6, 0.5, -0.5, 0.5, -0.5])
+    landmark = np.array([0.1, 0.2, 0.6, 1.0 if is_ahead else -1.0, 0.1, 0.0, rho])
+    block = Block(jnp.concatenate([pose, mount]), jnp.asarray(landmark), jnp.eye(7))
+    for config, is_seen in ((VC, is_ahead == (rho > 0)), (FilterConfig(see_beyond_infinity=True), is_ahead)):
+        observation = observe(config, Camera(), block)
+        assert bool(observation.is_visible) == bool(observation.is_near) == is_seen
 
 
 def test_births_go_by_the_lowest_id(recording):

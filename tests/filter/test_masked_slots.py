@@ -13,8 +13,11 @@ from filter_runs import CAPACITY, filtered, frame_of, head, ids, joint, recorded
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.state import VEHICLE
+from vcjax.gates.either import Either
+from vcjax.gates.inlier_ratio import InlierRatio
+from vcjax.gates.velocity_glr import VelocityGLR
 
-VC = FilterConfig(max_landmarks=CAPACITY, retire=False)
+VC = FilterConfig(max_landmarks=CAPACITY, retire=False, detector=Either(VelocityGLR(), InlierRatio()))
 FROM, TO = 24, 30
 HUGE = 1e30
 
@@ -50,7 +53,7 @@ def cluttered(state):
             fill(state.landmarks, is_free[:, None]),
             fill(state.to_coordinates, is_free[:, None, None]),
             fill(state.is_euclidean, is_free),
-            jax.tree.map(lambda leaf: fill(leaf, is_free), state.detector),
+            jax.tree.map(lambda leaf: fill(leaf, is_free.reshape(-1, *(1,) * (leaf.ndim - 1))), state.detector),
             fill(state.P_vm, rows),
             fill(state.P_mm, rows | rows[:, None]),
         ),

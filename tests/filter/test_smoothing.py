@@ -55,7 +55,8 @@ def test_straight_through_is_the_hard_filter_to_the_bit(gate):
     state, info = quick_run(config(gate, smoothing="straight_through"), recording())
     assert hard.is_accepted.any() and (hard.is_measured & ~hard.is_accepted).any()
     assert isinstance(gate, ReprojectionError) or (hard.is_recovered.any() and hard.is_dynamic.any())
-    judged = ("p_dynamic", "re1_prior", "re2")  # here of every measured candidate, there of the isolated
+    # Soft here and hard there; here of every measured candidate, there of the isolated.
+    judged = ("p_dynamic", "p_detector", "re1_prior", "re2")
     for name in (field.name for field in dataclasses.fields(FrameInfo) if field.name not in judged):
         np.testing.assert_array_equal(getattr(info, name), getattr(hard, name), err_msg=name)
     mapped = np.asarray(state.is_mapped)

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gates.evidence import born, evidence
 from gates.linear_blocks import MODEL, linear_candidates
 
 from vcjax.fields import number
 from vcjax.filter.config import FilterConfig
-from vcjax.gates.gate import AbstractDetector, AbstractGate, Evidence, Prior, Verdict
+from vcjax.gates.gate import AbstractDetector, AbstractGate, Prior, Verdict
 from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.virtual_correction import VirtualCorrection
@@ -36,20 +37,17 @@ class PixelDistance(AbstractGate):
         return Verdict(margin, nothing, nothing)
 
 
-class Cusum(AbstractDetector):
-    """A detector with memory: the cumulative sum of RE₁ above what a static landmark shows on average."""
+class Largest(AbstractDetector):
+    """A detector with memory: the largest RE₁ that a landmark ever had."""
 
-    drift: float = eqx.field(converter=number, default=4.0)
     limit: float = eqx.field(converter=number, default=20.0)
 
     def born(self):
         return jnp.zeros(())
 
     def observe(self, state, evidence):
-        is_used = evidence.is_searched & evidence.is_measured
-        total = jnp.maximum(state[evidence.slot] + evidence.re1 - self.drift, 0.0)
-        state = state.at[evidence.slot].set(jnp.where(is_used, total, state[evidence.slot]))
-        return state, evidence.is_visible & (state > self.limit)
+        state = state.at[evidence.slot].max(jnp.where(evidence.is_found, evidence.re1, 0.0))
+        return state, state - self.limit
 
 
 def test_new_gate_judges():
@@ -63,25 +61,18 @@ def test_new_gate_judges():
 
 
 def test_new_detector_remembers_each_slot():
-    detector = Cusum()
-    evidence = Evidence(
-        slot=jnp.array([2, 0, 3]),
-        is_searched=jnp.array([True, True, True]),
-        is_measured=jnp.array([True, True, False]),
-        is_corrected=jnp.array([True, True, False]),
-        re1=jnp.array([9.0, 2.0, np.nan]),  # slot 2 fits badly, slot 0 well, slot 3 is not found
-        is_visible=jnp.ones(4, bool),
-    )
-    state, flags = jnp.zeros(4), []
-    for _ in range(6):
-        state, is_flagged = jax.jit(Cusum.observe)(detector, state, evidence)
-        flags.append(is_flagged)
-    np.testing.assert_array_equal(state, [0, 0, 30, 0])
-    np.testing.assert_array_equal(np.argwhere(flags), [[4, 2], [5, 2]])  # 25 and 30 exceed 20
+    detector, is_measured = Largest(), np.array([True, True, False])
+    state, margins = born(detector, 4), []
+    for re1 in ([9.0, 2.0, np.nan], [25.0, 1.0, np.nan], [3.0, 1.0, np.nan]):  # slot 3 is not found
+        frame = evidence([2, 0, 3], 4, is_measured=is_measured, re1=np.array(re1))
+        state, margin = jax.jit(Largest.observe)(detector, state, frame)
+        margins.append(margin)
+    np.testing.assert_array_equal(state, [2, 0, 25, 0])
+    np.testing.assert_array_equal(np.argwhere(np.array(margins) > 0), [[1, 2], [2, 2]])
 
 
 GATES = [ReprojectionError(), VirtualCorrection(), PixelDistance()]
-DETECTORS = [InlierRatio(), Cusum()]
+DETECTORS = [InlierRatio(), Largest()]
 
 
 @pytest.mark.parametrize(("gate", "detector"), list(itertools.product(GATES, DETECTORS)))

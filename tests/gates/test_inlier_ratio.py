@@ -1,13 +1,13 @@
 """The deletion rule: its counts and flags against a plain Python simulation."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gates.evidence import born, evidence, frames, observe_all, random_record
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
-from vcjax.gates.gate import Evidence
 from vcjax.gates.inlier_ratio import Counts, InlierRatio
 
 NUM_SLOTS, NUM_CANDIDATES, NUM_FRAMES = 5, 3, 40
@@ -24,34 +24,29 @@ def random_evidence(seed):
     # Where not searched the rest means nothing: there anything is set.
     is_corrected = np.where(is_searched, is_measured & fits, fits)
     is_visible = rng.random((NUM_FRAMES, NUM_SLOTS)) < 0.8
-    re1 = np.full(shape, np.nan)
-    return tuple(map(jnp.array, (slot, is_searched, is_measured, is_corrected, re1, is_visible)))
+    masks = dict(is_searched=is_searched, is_measured=is_measured, is_corrected=is_corrected, is_visible=is_visible)
+    masks = {name: jnp.asarray(value) for name, value in masks.items()}
+    return random_record(seed) | {"slot": jnp.asarray(slot)} | masks
 
 
-@jax.jit
-def observe_all(detector, evidence):
+def counts_and_flags(detector, record):
     """States and flags after each frame. Nothing is deleted, so that the counts of flagged slots go on."""
-    state = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (NUM_SLOTS,)), detector.born())
-
-    def observe(state, evidence):
-        state, is_flagged = detector.observe(state, Evidence(*evidence))
-        return state, (state, is_flagged)
-
-    return jax.lax.scan(observe, state, evidence)[1]
+    states, margins = observe_all(detector, born(detector, NUM_SLOTS), record)
+    return states, np.asarray(margins) > 0
 
 
-def count_plainly(detector, evidence):
+def count_plainly(detector, record):
     """The same by Python integers, one candidate after another."""
     counts = [[1, 1, 1] for _ in range(NUM_SLOTS)]
-    for slots, is_searched, is_measured, is_corrected, _, is_visible in zip(*map(np.asarray, evidence), strict=True):
+    for frame in frames(record):
         for k in range(NUM_CANDIDATES):
-            if is_searched[k]:
-                count = counts[slots[k]]
+            if frame.is_searched[k]:
+                count = counts[frame.slot[k]]
                 count[0] += 1
-                count[1] += int(is_measured[k])
-                count[2] += int(is_corrected[k])
+                count[1] += int(frame.is_measured[k])
+                count[2] += int(frame.is_corrected[k])
         flags = [
-            bool(is_visible[i])
+            bool(frame.is_visible[i])
             and searched >= detector.min_searches
             and (found / searched < detector.min_measured_ratio or fitted / found < detector.min_corrected_ratio)
             for i, (searched, found, fitted) in enumerate(counts)
@@ -63,16 +58,16 @@ def count_plainly(detector, evidence):
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(5, 0.25, 0.5), (10, 0.1, 0.5), (20, 0.1, 0.7)]))
 def test_counts_and_flags_are_the_plain_ones(seed, numbers):
     detector = InlierRatio(*numbers)
-    evidence = random_evidence(seed)
-    states, flags = observe_all(detector, evidence)
-    counts, expected = zip(*count_plainly(detector, evidence), strict=True)
+    record = random_evidence(seed)
+    states, flags = counts_and_flags(detector, record)
+    counts, expected = zip(*count_plainly(detector, record), strict=True)
     np.testing.assert_array_equal(np.stack(states, axis=-1), counts)
     np.testing.assert_array_equal(flags, expected)
 
 
 def test_both_ratios_and_only_they_flag():
     def is_anything_flagged(*ratios):
-        return bool(np.any(observe_all(InlierRatio(5, *ratios), random_evidence(3))[1]))
+        return bool(np.any(counts_and_flags(InlierRatio(5, *ratios), random_evidence(3))[1]))
 
     assert is_anything_flagged(1, 0)
     assert is_anything_flagged(0, 1)
@@ -81,16 +76,34 @@ def test_both_ratios_and_only_they_flag():
 
 @pytest.mark.parametrize("found", [7, 14, 28, 57])
 def test_a_ratio_exactly_at_its_bound_is_not_flagged(found):
-    nothing_happens = Evidence(*map(jnp.array, ([0], [False], [False], [False], [np.nan], [True])))
+    nobody = np.array([False])
+    nothing_happens = evidence([0], 1, is_searched=nobody, is_measured=nobody, is_corrected=nobody)
     detector = InlierRatio(min_measured_ratio=found / 100)
     for num_found, is_bad in ((found, False), (found - 1, True)):
         state = Counts(*(jnp.array([float(n)]) for n in (100, num_found, num_found)))
-        assert bool(detector.observe(state, nothing_happens)[1][0]) == is_bad
+        assert bool(detector.observe(state, nothing_happens)[1][0] > 0) == is_bad
+
+
+def test_the_margin_is_the_deviance_of_a_binomial_share():
+    """Twice the log likelihood ratio of the share found and its bound, by scipy, with the verdict's sign."""
+    nobody = np.array([False] * 3)
+    nothing_happens = evidence([0, 1, 2], 3, is_searched=nobody, is_measured=nobody, is_corrected=nobody)
+    found, fitted = np.array([40, 40, 3]), np.array([30, 12, 3])
+    counts = Counts(jnp.full(3, 40.0), jnp.array(found, float), jnp.array(fitted, float))
+    _, margin = InlierRatio().observe(counts, nothing_happens)
+
+    def deviance(hits, tries, bound):
+        size = 2 * (stats.binom.logpmf(hits, tries, hits / tries) - stats.binom.logpmf(hits, tries, bound))
+        return np.where(hits / tries < bound, size, -size)
+
+    expected = np.maximum(deviance(found, 40, 0.1), deviance(fitted, found, 0.5))
+    np.testing.assert_allclose(margin, expected, rtol=1e-9)
+    assert (expected > 0).tolist() == [False, True, True]
 
 
 def test_infinitely_many_searches_switch_the_rule_off():
-    assert observe_all(InlierRatio(5), random_evidence(1))[1].any()
-    assert not observe_all(InlierRatio(np.inf), random_evidence(1))[1].any()
+    assert counts_and_flags(InlierRatio(5), random_evidence(1))[1].any()
+    assert not counts_and_flags(InlierRatio(np.inf), random_evidence(1))[1].any()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """What a run found out about each feature, against Python loops."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,6 +48,25 @@ def test_margins_and_first_frames_equal_python_loops(run_and_truth):
         ("first_deleted", deleted, 0),
     ):
         np.testing.assert_allclose(found[name], [by_feature.get(f, none) for f in range(num)], rtol=1e-14, err_msg=name)
+
+
+def test_a_feature_has_the_largest_margin_of_the_detector(run_and_truth):
+    """Whatever slots it was in; NaN says nothing, and neither does what is said of a slot that nobody held."""
+    info, truth = run_and_truth
+    rng = np.random.default_rng(0)
+    margins = rng.normal(size=info.detector_margin.shape)
+    margins[rng.random(margins.shape) < 0.5] = np.nan
+    found = detections(dataclasses.replace(info, detector_margin=jnp.asarray(margins)), truth)
+    largest = {}
+    for feature, margin in zip(np.ravel(info.watched_id), margins.ravel(), strict=True):
+        if feature >= 0 and not np.isnan(margin):
+            largest[int(feature)] = max(largest.get(int(feature), -np.inf), margin)
+    expected = np.array([largest.get(f, np.nan) for f in range(len(truth.is_moving))])
+    np.testing.assert_array_equal(found["detector_margin"], expected)
+    assert len(largest) > 10
+    np.testing.assert_allclose(found["detector_auc"], area_under_roc(jnp.asarray(expected), truth.is_moving))
+    held = np.asarray(info.watched_id)[1:] >= 0
+    np.testing.assert_array_equal(np.isnan(np.asarray(info.detector_margin)[1:][~held]), True)
 
 
 def test_without_verdicts_the_margin_is_that_of_the_update_gate():

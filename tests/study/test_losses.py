@@ -32,7 +32,17 @@ IS_MOVING = np.array([True, True, False, False, True])  # the last is never seen
 NUM_FRAMES, NUM_CANDIDATES = IDS.shape
 
 
-def info(p=P, error_m=0.1, variance_m2=0.01, inconsistent_id=((-1,),) * NUM_FRAMES) -> FrameInfo:
+NOBODY = ((-1,),) * NUM_FRAMES
+
+
+def info(
+    p=P,
+    error_m=0.1,
+    variance_m2=0.01,
+    inconsistent_id=NOBODY,
+    watched_id=NOBODY,
+    p_detector=((0.0,),) * NUM_FRAMES,
+) -> FrameInfo:
     """A made-up run of three frames; what the losses do not read is empty."""
     vehicle = np.zeros((NUM_FRAMES, 14))
     vehicle[:, 0], vehicle[:, [3, 10]] = error_m, 1.0
@@ -46,6 +56,8 @@ def info(p=P, error_m=0.1, variance_m2=0.01, inconsistent_id=((-1,),) * NUM_FRAM
             is_measured=jnp.asarray(IS_MEASURED),
             p_dynamic=jnp.asarray(p),
             inconsistent_id=jnp.asarray(inconsistent_id),
+            watched_id=jnp.asarray(watched_id),
+            p_detector=jnp.asarray(p_detector),
         )
     )
 
@@ -72,10 +84,25 @@ def test_a_track_is_called_dynamic_at_least_once(unchecked):
 
 
 def test_a_track_that_the_detector_deletes_is_called_dynamic(unchecked):
-    found = tracks(info(inconsistent_id=((-1,), (2,), (4,))), truth())
+    deleted = dict(inconsistent_id=((-1,), (2,), (4,)), watched_id=((2,), (2,), (4,)))
+    found = tracks(info(**deleted, p_detector=((0.0,), (1.0,), (1.0,))), truth())
     np.testing.assert_array_equal(found.counts, [True] * 5)
     np.testing.assert_array_equal(found.is_mover, IS_MOVING)
     np.testing.assert_allclose(found.p[jnp.array([2, 4])], 1.0, rtol=0)
+
+
+def test_the_largest_degree_of_the_detector_counts_once(unchecked):
+    """Features 0 and 3 are watched in two slots, feature 4 never was a candidate; the free slot's degree is nothing."""
+
+    def degrees(p_detector):
+        watched = info(watched_id=((0, 3), (3, 0), (4, -1)), p_detector=p_detector)
+        return tracks(watched, truth()).p
+
+    by_detector = jnp.array([[0.2, 0.25], [0.5, 0.0], [0.9, 0.9]])
+    expected = [1 - 0.8 * 0.8 * 0.5, 1 - 0.1 * 0.5 * 1.0, 0.1, 1.0, 0.0]
+    np.testing.assert_allclose(degrees(by_detector), expected, atol=2e-9)
+    gradient = jax.grad(lambda p: degrees(p)[0])(by_detector)
+    np.testing.assert_allclose(gradient, [[0.8 * 0.5, 0], [0, 0], [0, 0]], atol=2e-9)
 
 
 LABELLED = st.integers(1, 12).flatmap(

@@ -1,4 +1,4 @@
-"""`vcjax run`: one scenario with one gate."""
+"""`vcjax run`: one scenario with one gate and one detector."""
 
 import dataclasses
 from pathlib import Path
@@ -18,11 +18,14 @@ from vcjax.study.results import describe, save
 from vcjax.study.summary import summarise
 
 GateName = Literal["RE", "VC"]
+DetectorName = Literal[
+    "inlier_ratio", "velocity_glr", "velocity_likelihood_ratio", "windowed_nis", "cusum", "immediate"
+]
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Run one scenario with one gate for some seeds, print a summary and save the runs."""
+    """Run one scenario with one gate and one detector for some seeds, print a summary and save the runs."""
 
     scenario: Annotated[Scenario, tyro.conf.arg(constructor=paper)]
     """The experiment."""
@@ -30,6 +33,8 @@ class Run:
     """The filter."""
     gate: GateName = "VC"
     """Update gate: RE (re-projection error) or VC (virtual correction)."""
+    detector: DetectorName = "inlier_ratio"
+    """Which landmarks are deleted over time."""
     seeds: int = 25
     """Number of runs."""
     key: int = 0

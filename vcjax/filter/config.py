@@ -45,8 +45,13 @@ class FilterConfig(eqx.Module):
     at once if landmarks are chosen among the measured; among the predicted, where it may still use up a place for
     update or be deleted by the detector, once it is predicted far outside the image (`features.NEAR_PX`). Exact for
     everything that stays, unless a landmark would come back from there, as badly mapped ones rarely do."""
+    see_beyond_infinity: bool = eqx.field(static=True, default=False)
+    """Whether a landmark whose inverse depth has become negative by corrections of others is still looked for: it lies
+    in the direction it was seen in, farther off than can be told, and its next correction may bring it back. If not, as
+    in the paper's toolbox, it lies behind the camera, and stays in the map unseen: many movers that were badly mapped
+    in their first frames end so, and are never found."""
     blacklist_capacity: int = eqx.field(static=True, default=0)
-    """How many deleted features are remembered and never born again; 0: a deleted feature may come back."""
+    """How many deleted features are remembered and kept from being born again; 0: a deleted feature may come back."""
     skip_free_slots: bool | None = eqx.field(static=True, default=None)
     """Pass over the part of P in use only, by a loop whose length depends on the map: best where runs go one by one, as
     on a CPU. False passes over all of P at once: for runs side by side, as on an accelerator. None: by the default
@@ -75,6 +80,8 @@ class FilterConfig(eqx.Module):
     """What an inverse depth becomes that a correction made negative, 1/m; positive."""
     linearity_max: float = eqx.field(converter=number, default=0.1)
     """Linearity index below which an AHP landmark becomes Euclidean; at least 0 (0: never)."""
+    blacklist_frames: float = eqx.field(converter=number, default=np.inf)
+    """For how many frames a deleted feature is kept from being born again; at least 0, infinity: for good."""
     birth_margin_px: float = eqx.field(converter=number, default=25.6)
     """Distance from every image border a new feature must keep, px; at least 0."""
 
@@ -87,6 +94,8 @@ class FilterConfig(eqx.Module):
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
         for name in ("oscillation_std_m", "linearity_max", "birth_margin_px"):
             require(self, name, lambda v: np.isfinite(v) & (v >= 0), "give a number of at least 0.")
+        frames = "give a number of frames of at least 0, or infinity: for good."
+        require(self, "blacklist_frames", lambda n: n >= 0, frames)
         for name in ("max_landmarks", "max_updates"):
             require_count(self, name, 1)
         for name in ("births_first_frame", "births_per_frame", "blacklist_capacity"):
@@ -97,7 +106,7 @@ class FilterConfig(eqx.Module):
             ("choose_among", ("predicted", "measured")),
             ("birth_order", ("lowest_id", "random")),
             ("skip_free_slots", (None, True, False)),
-            *((name, (True, False)) for name in ("retire", "reverse_mode", "toolbox_parity")),
+            *((name, (True, False)) for name in ("see_beyond_infinity", "retire", "reverse_mode", "toolbox_parity")),
         ):
             require_choice(self, name, choices)
         if self.update == "stacked" and self.smoothing != "hard":

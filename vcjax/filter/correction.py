@@ -42,6 +42,8 @@ class Innovation(NamedTuple):
     """zᵀ S⁻¹ z. Equation (13)."""
     is_visible: Bool[Array, "*b"]
     """Predicted inside the image."""
+    H_l: Float[Array, "*b 2 7"]
+    """The landmark's part of H, by the errors of its slot."""
 
 
 class Gain(NamedTuple):
@@ -64,7 +66,9 @@ def innovate(
     HP = H @ block_rows(submap.P, j) - HU @ submap.U
     S = block_columns(HP, j) @ H.T + pixel_cov(config, H.dtype)
     z = uv_px - observation.pixel
-    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible), Gain(H, HP, HU)
+    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible, H[:, VEHICLE:]), Gain(
+        H, HP, HU
+    )
 
 
 def correct_with(
@@ -104,8 +108,8 @@ def correct_with(
             write(submap.w, w, 2 * c),
         ),
     )
-    if submap.D is not None:
-        moved = eqx.tree_at(lambda s: s.D, moved, write(submap.D, jnp.broadcast_to(2.0 * g - g**2, 2), 2 * c))
+    if submap.g is not None:
+        moved = eqx.tree_at(lambda s: s.g, moved, write(submap.g, jnp.broadcast_to(g, 2), 2 * c))
     variance = _inverse_depth_variance(moved, j)
     noted = AtCorrection(block(moved, j).landmark, variance, vehicle_before)
     at_correction = jax.tree.map(lambda rows, new: write(rows, new[None], j, is_noted), submap.at_correction, noted)

@@ -52,7 +52,8 @@ def observe(config: FilterConfig, camera: Camera, block: Block) -> Observation:
     H = jnp.concatenate(
         [U_r[:, :3], U_r[:, 3:] @ robot_H, U_s[:, :3], U_s[:, 3:] @ sensor_H, U_l @ block.to_coordinates], axis=1
     )
-    is_in_front = depth > 0
+    # v_z = depth ρ, of the homogeneous point, says where its direction points, whatever the sign of ρ.
+    is_in_front = (depth * block.landmark[INVERSE_DEPTH] if config.see_beyond_infinity else depth) > 0
     return Observation(
         pixel, is_inside(camera, pixel) & is_in_front, is_inside(camera, pixel, -NEAR_PX) & is_in_front, H
     )

@@ -31,6 +31,8 @@ class Outcome(NamedTuple):
     """By how much a candidate passes what keeps it from being called dynamic, χ²; NaN where not measured."""
     p_dynamic: Float[Array, " K"]
     """Soft: to what degree a candidate is neither accepted nor recovered."""
+    weight: Float[Array, " K"]
+    """To what degree a candidate was used."""
 
 
 def correct_frame(
@@ -88,11 +90,16 @@ def correct_frame(
     # A gate without verdicts has none to add to the margin by which it leaves out.
     dynamic_margin = jnp.where(is_isolated, jnp.fmin(-margin, verdict.margin), -margin)
     dynamic_margin = jnp.where(is_measured, dynamic_margin, jnp.nan)
+    weight = (is_accepted | is_recovered).astype(uv_px.dtype)
     if config.smoothing == "hard":
         p_dynamic = is_dynamic.astype(uv_px.dtype)
     else:
-        p_dynamic = jnp.where(is_measured, 1.0 - _soft_weight(config, margin, verdict), 0.0)
-    return submap, Outcome(innovation, verdict, is_accepted, is_recovered, is_dynamic, dynamic_margin, p_dynamic)
+        soft_weight = jnp.where(is_measured, _soft_weight(config, margin, verdict), 0.0)
+        p_dynamic = jnp.where(is_measured, 1.0 - soft_weight, 0.0)
+        weight = soft_weight if config.smoothing == "soft" else straight_through(weight, soft_weight)
+    return submap, Outcome(
+        innovation, verdict, is_accepted, is_recovered, is_dynamic, dynamic_margin, p_dynamic, weight
+    )
 
 
 def _soft_weight(

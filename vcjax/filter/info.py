@@ -1,7 +1,7 @@
 """FrameInfo: what a person wants to see of a frame, and the next frame does not need."""
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 
 class FrameInfo(eqx.Module):
@@ -40,6 +40,14 @@ class FrameInfo(eqx.Module):
     p_dynamic: Float[Array, " K"]
     """Soft: to what degree a measured candidate is neither accepted nor recovered, in [0, 1]; with hard decisions 1
     where dynamic, else 0."""
+    watched_id: Int[Array, " L"]
+    """Feature held by each slot when the detector looked; -1 where free, or just called dynamic by the gate."""
+    detector: PyTree
+    """The detector's state of every slot then (leading axis L), before any landmark was deleted or born."""
+    detector_margin: Float[Array, " L"]
+    """The detector's margin, χ² units: deleted where above 0; NaN where it has nothing to say."""
+    p_detector: Float[Array, " L"]
+    """Soft: to what degree the detector calls it dynamic, in [0, 1]; with hard decisions 1 where it does, else 0."""
     inconsistent_id: Int[Array, " L"]
     """Features deleted by the detector; -1 elsewhere."""
     born_id: Int[Array, " births"]

@@ -32,14 +32,20 @@ def retire(config: FilterConfig, state: FilterState, is_near: Bool[Array, " L"])
     return delete(state, is_retired)
 
 
-def ban(state: FilterState, is_banned: Bool[Array, " L"]) -> FilterState:
-    """Put the features of some slots on the blacklist, newest first; the oldest fall off when it is full."""
+def ban(config: FilterConfig, state: FilterState, is_banned: Bool[Array, " L"]) -> FilterState:
+    """Put the features of some slots on the blacklist, newest first, once in every frame.
+
+    Those whose time is over fall off, and the oldest when it is full.
+    """
     capacity = state.blacklist.shape[0]
     if capacity == 0:
         return state
+    frames = jnp.asarray(config.blacklist_frames, state.blacklist_left.dtype)
+    left = jnp.concatenate([jnp.broadcast_to(frames, is_banned.shape), state.blacklist_left - 1])
     everyone = jnp.concatenate([jnp.where(is_banned, state.track_id, FREE), state.blacklist])
-    newest_first = jnp.argsort(everyone == FREE, stable=True)
-    return eqx.tree_at(lambda s: s.blacklist, state, everyone[newest_first[:capacity]])
+    everyone = jnp.where(left > 0, everyone, FREE)
+    newest_first = jnp.argsort(everyone == FREE, stable=True)[:capacity]
+    return eqx.tree_at(lambda s: (s.blacklist, s.blacklist_left), state, (everyone[newest_first], left[newest_first]))
 
 
 def give_birth(

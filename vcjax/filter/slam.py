@@ -10,18 +10,19 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from vcjax.fields import require_kind
 from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig, check_arguments
+from vcjax.filter.evidence import evidence_of
 from vcjax.filter.features import choose, match, predict_features
 from vcjax.filter.frame_corrections import correct_frame
 from vcjax.filter.info import FrameInfo
 from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state, slot_count
 from vcjax.filter.submap import gather, normalise, scatter
-from vcjax.gates.gate import Evidence
+from vcjax.gates.surrogates import decide
 from vcjax.models.motion import move_by_odometry
 from vcjax.recording import Frame, Recording, validate
 
@@ -77,16 +78,11 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     is_visible = prediction.is_visible.at[slot].set(
         jnp.where(is_measured, innovation.is_visible, prediction.is_visible[slot])
     )
-    evidence = Evidence(
-        slot=slot,
-        is_searched=is_searched,
-        is_measured=is_measured,
-        is_corrected=outcome.is_accepted | outcome.is_recovered,
-        re1=innovation.re1,
-        is_visible=is_visible & ~is_dynamic,
-    )
-    detector, is_flagged = config.detector.observe(state.detector, evidence)
-    is_flagged &= state.is_mapped & ~is_dynamic
+    is_watched = state.is_mapped & ~is_dynamic
+    evidence = evidence_of(submap, outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, frame.time_step_s)
+    detector, margin = config.detector.observe(_of_mapped(config, state), evidence)
+    margin = jnp.where(is_watched, margin, jnp.nan).astype(state.P_vv.dtype)
+    is_flagged = margin > 0
     state = eqx.tree_at(lambda s: s.detector, state, detector)
 
     info_of_candidates = dict(
@@ -103,10 +99,14 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         is_dynamic=outcome.is_dynamic,
         dynamic_margin=outcome.dynamic_margin,
         p_dynamic=outcome.p_dynamic,
+        watched_id=jnp.where(is_watched, state.track_id, FREE),
+        detector=detector,
+        detector_margin=margin,
+        p_detector=decide("hard" if config.smoothing == "hard" else "soft", margin, config.temperature),
         inconsistent_id=jnp.where(is_flagged, state.track_id, FREE),
     )
     is_deleted = is_dynamic | is_flagged
-    state = landmark_map.delete(landmark_map.ban(state, is_deleted), is_deleted)
+    state = landmark_map.delete(landmark_map.ban(config, state, is_deleted), is_deleted)
     if config.retire:
         state = landmark_map.retire(config, state, prediction.is_near)
     has_ended = state.has_ended | (frame.is_last[column] & (column >= 0))
@@ -115,6 +115,15 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     place = jnp.where(state.is_mapped & (column >= 0), column, num_features)
     is_mapped = jnp.zeros(num_features, bool).at[place].set(True, mode="drop")
     return _finish(config, state, frame, is_mapped, config.births_per_frame, info_of_candidates)
+
+
+def _of_mapped(config: FilterConfig, state: FilterState) -> PyTree:
+    """The detector's states, of free slots as at birth: what is left of the landmark before must have no effect."""
+
+    def born_if_free(born, leaf):
+        return jnp.where(state.is_mapped.reshape(-1, *(1,) * (leaf.ndim - 1)), leaf, born)
+
+    return jax.tree.map(born_if_free, config.detector.born(), state.detector)
 
 
 def _check_step(config: FilterConfig, state: FilterState, frame: Frame) -> None:
@@ -156,7 +165,7 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
     # The start's covariance may hold variance along a quaternion, which births must not see.
     vehicle, N = normalise(config, state.vehicle)
     state = eqx.tree_at(lambda s: (s.vehicle, s.P_vv), state, (vehicle, N @ state.P_vv @ N.T))
-    K, dtype = config.max_updates, state.P_vv.dtype
+    K, L, dtype = config.max_updates, slot_count(config), state.P_vv.dtype
     nobody, nothing = jnp.zeros(K, bool), jnp.full(K, jnp.nan, dtype)
     info_of_candidates = dict(
         candidate_id=jnp.full(K, FREE, jnp.int32),
@@ -172,7 +181,11 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
         is_dynamic=nobody,
         dynamic_margin=nothing,
         p_dynamic=jnp.zeros(K, dtype),
-        inconsistent_id=jnp.full(slot_count(config), FREE, jnp.int32),
+        watched_id=jnp.full(L, FREE, jnp.int32),
+        detector=state.detector,
+        detector_margin=jnp.full(L, jnp.nan, dtype),
+        p_detector=jnp.zeros(L, dtype),
+        inconsistent_id=jnp.full(L, FREE, jnp.int32),
     )
     is_mapped = jnp.zeros_like(frame.is_valid)
     return _finish(config, state, frame, is_mapped, config.births_first_frame, info_of_candidates)

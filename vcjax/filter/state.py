@@ -56,6 +56,8 @@ class FilterState(eqx.Module):
     """The detector's state of every slot."""
     blacklist: Int[Array, " B"]
     """Deleted features that must not be born again, newest first; -1 where empty."""
+    blacklist_left: Float[Array, " B"]
+    """For how many frames more; meaningless where empty."""
     key: PRNGKeyArray | None
     """Key of the random birth order; None where births go by id."""
 
@@ -108,6 +110,7 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
         has_ended=jnp.zeros(num_slots, bool),
         detector=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_slots, *leaf.shape)), config.detector.born()),
         blacklist=jnp.full(config.blacklist_capacity, FREE, jnp.int32),
+        blacklist_left=jnp.zeros(config.blacklist_capacity, dtype),
         key=key,
     )
 

@@ -48,8 +48,8 @@ class Submap(eqx.Module):
     """P⁰, the covariance the frame began with."""
     U: Float[Array, "M n"]
     """Rows u_j of the corrections so far, two for each of C; M = 2 C."""
-    D: Float[Array, " M"] | None
-    """Their weights in P, 2 g - g² for a correction of weight g; None in the hard filter, where they are 1."""
+    g: Float[Array, " M"] | None
+    """Their weights; None in the hard filter, where they are 1."""
     H: Float[Array, "C 2 21"]
     """Their measurement derivatives."""
     T: Float[Array, "M M"]
@@ -92,8 +92,8 @@ def block_cov(submap: Submap, j: int | Int[Array, ""]) -> Float[Array, "21 21"]:
 
 
 def weighted(submap: Submap, columns: Float[Array, "*n M"]) -> Float[Array, "*n M"]:
-    """Columns, one for each row of U, times D."""
-    return columns if submap.D is None else columns * submap.D
+    """Columns, one for each row of U, times D = 2 g - g²."""
+    return columns if submap.g is None else columns * (2.0 * submap.g - submap.g**2)
 
 
 def block_columns(matrix: Float[Array, "rows n"], j: int | Int[Array, ""]) -> Float[Array, "rows 21"]:
@@ -127,7 +127,7 @@ def gather(
         shift=jnp.zeros(P.shape[0], P.dtype),
         P=P,
         U=jnp.zeros((2 * num_corrections, P.shape[0]), P.dtype),
-        D=None if config.smoothing == "hard" else jnp.zeros(2 * num_corrections, P.dtype),
+        g=None if config.smoothing == "hard" else jnp.zeros(2 * num_corrections, P.dtype),
         H=jnp.zeros((num_corrections, 2, VEHICLE + SLOT), P.dtype),
         T=jnp.zeros((2 * num_corrections, 2 * num_corrections), P.dtype),
         w=jnp.zeros(2 * num_corrections, P.dtype),

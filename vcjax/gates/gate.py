@@ -1,10 +1,10 @@
 """The two contracts of feature rejection: an update gate and a detector.
 
 A **gate** says within one frame which measurements correct the state: it accepts a candidate by its RE₁, and passes a
-verdict on those it did not accept, each with its own 21-block of robot, sensor and landmark. It says so by margins, how
-far a number lies from its threshold, which `gates.surrogates` turns into decisions, hard or soft. A **detector**
-watches landmark slots over many frames, keeps a state for each, and flags the ones to delete. The two combine
-freely.
+verdict on those it did not accept, each with its own 21-block of robot, sensor and landmark. A **detector** watches
+landmark slots over many frames, keeps a state for each, and flags the ones to delete. Both say so by margins, how far a
+number lies from its threshold, which `gates.surrogates` turns into decisions, hard or soft. The two combine freely, and
+so do detectors (see `either`).
 
 A new gate or detector is one new file with one small class. All methods are pure, masked and batched; what is not a
 candidate must neither change a result nor a gradient.
@@ -126,22 +126,75 @@ class Evidence(eqx.Module):
     is_searched: Bool[Array, " K"]
     """Chosen for update in this frame. The rest is false or meaningless where this is false."""
     is_measured: Bool[Array, " K"]
-    """Found in the image."""
+    """Found in the image. The numbers below are meaningless where this is false, but for weight and gain, zero."""
     is_corrected: Bool[Array, " K"]
     """Used in a formal correction, accepted or recovered."""
+    weight: Float[Array, " K"]
+    """To what degree it was used, in [0, 1]: 0 or 1 unless the filter is soft (see `surrogates`)."""
+    innovation: Float[Array, "K 2"]
+    """z as gated, px. Equation (8)."""
+    innovation_cov: Float[Array, "K 2 2"]
+    """S, its covariance, px². Equation (9)."""
+    H: Float[Array, "K 2 7"]
+    """Derivative of the pixel by the landmark's part of the state, in its slot's error coordinates."""
+    gain: Float[Array, "K 7 2"]
+    """The landmark's own rows of the gain, weighted: what the frame's corrections moved its slot by, per px of its
+    innovation; zero where it was not used."""
     re1: Float[Array, " K"]
     """RE₁ as gated (13)."""
+    dynamic_margin: Float[Array, " K"]
+    """By how much it passes what keeps the gate from calling it dynamic or leaving it out, χ² units."""
     is_visible: Bool[Array, " L"]
     """Mapped and inside the image by its last projection."""
+    time_step_s: Float[Array, ""]
+    """Time since the frame before, s."""
+
+    @property
+    def is_found(self) -> Bool[Array, " K"]:
+        """Searched and found: the candidates with an innovation."""
+        return self.is_searched & self.is_measured
+
+    def found(self, *values: Array) -> tuple[Array, ...]:
+        """Some of the arrays above (K, …), with 0 for candidates that were not found, I for their covariance.
+
+        What means nothing, NaN included, then has no effect on what is computed, and leaves derivatives finite.
+        """
+        instead = (jnp.eye(2, dtype=v.dtype) if v is self.innovation_cov else jnp.zeros((), v.dtype) for v in values)
+        return tuple(jnp.where(_like(self.is_found, v), v, i) for v, i in zip(values, instead, strict=True))
+
+
+def add_at_slots(evidence: Evidence, total: Array, values: Array) -> Array:
+    """A per-slot array (L, …) with values (K, …) of the candidates that were found added at their slots."""
+    return total.at[evidence.slot].add(jnp.where(_like(evidence.is_found, values), values, 0).astype(total.dtype))
+
+
+def set_at_slots(evidence: Evidence, before: Array, values: Array) -> Array:
+    """A per-slot array (L, …) with values (K, …) of the candidates that were found in place of what was there."""
+    values = jnp.where(_like(evidence.is_found, values), values, before[evidence.slot])
+    return before.at[evidence.slot].set(values)
+
+
+def _like(mask: Bool[Array, " K"], values: Array) -> Array:
+    """A mask with as many axes as what it masks."""
+    return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
 
 class AbstractDetector(eqx.Module):
-    """Detector with a state for each landmark slot."""
+    """Detector with a state for each landmark slot.
+
+    The state begins anew at every birth; of a free slot it is that of a birth. A slot keeps the seven AHP error
+    coordinates it was born with for life (see `filter.state`), and `Evidence` speaks of a landmark in these: at a
+    reparametrisation nothing changes for a detector, and no state needs to be transformed.
+    """
 
     @abstractmethod
     def born(self) -> PyTree:
         """State of one slot at its landmark's birth. Slots are reset to it; its structure is that of all states."""
 
     @abstractmethod
-    def observe(self, state: PyTree, evidence: Evidence) -> tuple[PyTree, Bool[Array, " L"]]:
-        """New state (leading axis L) and the slots whose landmark is to be deleted."""
+    def observe(self, state: PyTree, evidence: Evidence) -> tuple[PyTree, Float[Array, " L"]]:
+        """New state (leading axis L) and each slot's margin: its landmark is deleted where above 0.
+
+        A margin says by how much, in χ² units, what was seen exceeds what a static landmark may show; NaN where nothing
+        can be said. What it decides is smoothed, or not, by `surrogates`.
+        """

@@ -3,8 +3,10 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Float
 
 from vcjax.fields import number, require
 from vcjax.gates.gate import AbstractDetector, Evidence
@@ -22,7 +24,8 @@ class InlierRatio(AbstractDetector):
     """Flag a visible landmark, searched at least `min_searches` times, that was found or fitted too seldom.
 
     Flagged when measured/searched < `min_measured_ratio` or corrected/measured < `min_corrected_ratio`. All counts
-    start at one. Its decisions have zero derivative.
+    start at one. Its margin is the larger of the two ratios' deviances, the χ²₁ statistic of a binomial share k/n held
+    against its bound p, 2 n KL(k/n ‖ p), with the sign of p - k/n; its derivative is zero.
     """
 
     min_searches: float = eqx.field(converter=number, default=10.0)
@@ -43,8 +46,8 @@ class InlierRatio(AbstractDetector):
         """One of each, as if the landmark had been searched, found and fitted once."""
         return Counts(jnp.ones(()), jnp.ones(()), jnp.ones(()))
 
-    def observe(self, state: Counts, evidence: Evidence) -> tuple[Counts, Bool[Array, " L"]]:
-        """Count this frame's candidates and flag by the ratios."""
+    def observe(self, state: Counts, evidence: Evidence) -> tuple[Counts, Float[Array, " L"]]:
+        """Count this frame's candidates and compare the ratios with their bounds."""
 
         def count(total, happened):
             return total.at[evidence.slot].add((happened & evidence.is_searched).astype(total.dtype))
@@ -54,7 +57,18 @@ class InlierRatio(AbstractDetector):
             count(state.measured, evidence.is_measured),
             count(state.corrected, evidence.is_corrected),
         )
-        is_inconsistent = (state.measured / state.searched < self.min_measured_ratio) | (
-            state.corrected / state.measured < self.min_corrected_ratio
+        margin = jnp.maximum(
+            _deviance(state.measured, state.searched, self.min_measured_ratio),
+            _deviance(state.corrected, state.measured, self.min_corrected_ratio),
         )
-        return state, evidence.is_visible & (state.searched >= self.min_searches) & is_inconsistent
+        is_due = evidence.is_visible & (state.searched >= self.min_searches)
+        return state, jax.lax.stop_gradient(jnp.where(is_due, margin, np.nan))
+
+
+def _deviance(hits: Float[Array, " L"], tries: Float[Array, " L"], bound: float | Array) -> Float[Array, " L"]:
+    """2 n KL(k/n ‖ p), above 0 exactly where k/n < p and at most 0 elsewhere."""
+    share = hits / tries
+    log = jax.scipy.special.xlogy
+    divergence = log(share, share) - log(share, bound) + log(1 - share, 1 - share) - log(1 - share, 1 - bound)
+    size = 2.0 * tries * jnp.maximum(divergence, jnp.finfo(share.dtype).tiny)
+    return jnp.where(share < bound, size, -size)

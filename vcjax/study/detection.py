@@ -11,13 +11,15 @@ def detections(info: FrameInfo, truth: Truth) -> dict[str, Array]:
     """How often and when each feature (F,) was mapped and deleted, how dynamic it ever looked, and the run's AUC.
 
     `dynamic_margin` is the largest of all frames (see `FrameInfo`), NaN of a feature that was never a measured
-    candidate: a score by which features can be ranked, and above 0 where the gate has called it dynamic. Frames count
-    from 1; `first_mapped` and `first_deleted` are 0 where that never happened.
+    candidate: a score by which features can be ranked, and above 0 where the gate has called it dynamic.
+    `detector_margin` is the same of the detector's, NaN where it never had anything to say, and above 0 where it has
+    deleted the feature. Frames count from 1; `first_mapped` and `first_deleted` are 0 where that never happened.
     """
     num_features, is_moving = truth.is_moving.shape[0], jnp.asarray(truth.is_moving)
     dynamic_id = jnp.where(info.is_dynamic, info.candidate_id, -1)
     deleted_id = jnp.concatenate([dynamic_id, info.inconsistent_id], axis=1)
-    margin = _largest_by_feature(info.candidate_id, info.dynamic_margin, num_features)
+    margin = largest_by_feature(info.candidate_id, info.dynamic_margin, num_features)
+    detector_margin = largest_by_feature(info.watched_id, info.detector_margin, num_features)
     return {
         "dynamic_deletions": _count_by_feature(dynamic_id, num_features),
         "inconsistent_deletions": _count_by_feature(info.inconsistent_id, num_features),
@@ -25,7 +27,9 @@ def detections(info: FrameInfo, truth: Truth) -> dict[str, Array]:
         "first_mapped": _first_frame(info.track_id, num_features),
         "first_deleted": _first_frame(deleted_id, num_features),
         "dynamic_margin": margin,
+        "detector_margin": detector_margin,
         "detection_auc": area_under_roc(margin, is_moving),
+        "detector_auc": area_under_roc(detector_margin, is_moving),
         "is_moving": is_moving,
     }
 
@@ -66,7 +70,7 @@ def _first_frame(ids: Int[Array, "T n"], num_features: int) -> Int[Array, " F"]:
     return jnp.where(first == never, 0, first)
 
 
-def _largest_by_feature(ids: Int[Array, "T n"], value: Float[Array, "T n"], num_features: int) -> Float[Array, " F"]:
+def largest_by_feature(ids: Int[Array, "T n"], value: Float[Array, "T n"], num_features: int) -> Float[Array, " F"]:
     """Largest value of each feature over all frames, of those that are numbers; NaN where there is none."""
     places = jnp.where(jnp.isnan(value).ravel(), num_features, _places(ids, num_features))
     none = jnp.full(num_features, -jnp.inf, value.dtype)

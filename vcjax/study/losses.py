@@ -3,9 +3,9 @@
 All are finite with finite derivatives for every run that is, whatever was seen, and follow the smoothing of the run
 they are taken of (see `gates.surrogates`): a true gradient of a soft run, a declared one of a straight-through run,
 none through the verdicts of a hard run. `p` is the degree p_dynamic to which a candidate of a frame is called dynamic;
-of a track, seen in several frames, it is 1 - Π (1 - p): called so at least once. A track that the detector has deleted
-is called so too, whatever the gate says, and this has no derivative. Of a hard run the losses of the tracks are those
-of the features deleted.
+of a track, seen in several frames, it is 1 - (1 - p_detector) Π (1 - p): called so at least once, or by the detector.
+Whose statistic hardly changes from one frame to the next, so that its largest p_detector counts, once. Of a hard run
+the losses of the tracks are those of the features deleted.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from vcjax.fields import number, require
 from vcjax.filter.info import FrameInfo
 from vcjax.recording import Truth
 from vcjax.simulation.scenarios import Scenario
-from vcjax.study.detection import happened
+from vcjax.study.detection import happened, largest_by_feature
 from vcjax.study.metrics import trajectory_errors
 
 _CLOSEST = 1e-9
@@ -44,14 +44,15 @@ def candidates(info: FrameInfo, truth: Truth) -> Labelled:
 
 
 def tracks(info: FrameInfo, truth: Truth) -> Labelled:
-    """Every feature that was a measured candidate at least once, or deleted, (F,): p = 1 - Π (1 - p of its frames)."""
+    """Every feature that was a measured candidate at least once, or deleted, (F,)."""
     each, num_features = candidates(info, truth), truth.is_moving.shape[0]
     is_deleted = happened(info.inconsistent_id, num_features)
+    by_detector = jnp.nan_to_num(largest_by_feature(info.watched_id, info.p_detector, num_features))
     place = jnp.where(each.counts, info.candidate_id, num_features).ravel()
     log_not = jnp.log1p(-jnp.minimum(each.p, 1.0 - _CLOSEST)).ravel()
     total = jnp.zeros(num_features, log_not.dtype).at[place].add(log_not, mode="drop")
     counts = is_deleted | happened(jnp.where(each.counts, info.candidate_id, -1), num_features)
-    p = jnp.where(is_deleted, 1.0, -jnp.expm1(total))
+    p = jnp.where(counts, 1.0 - (1.0 - by_detector) * jnp.exp(total), 0.0)
     return Labelled(p, jnp.asarray(truth.is_moving) & counts, counts)
 
 

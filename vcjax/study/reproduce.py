@@ -20,9 +20,15 @@ from jaxtyping import PRNGKeyArray
 from vcjax.devices import together
 from vcjax.fields import require_key
 from vcjax.filter.config import FilterConfig
-from vcjax.gates.gate import AbstractGate
+from vcjax.gates.cusum import Cusum
+from vcjax.gates.gate import AbstractDetector, AbstractGate
+from vcjax.gates.immediate import Immediate
+from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.reprojection import ReprojectionError
+from vcjax.gates.velocity_glr import VelocityGLR
+from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio
 from vcjax.gates.virtual_correction import VirtualCorrection
+from vcjax.gates.windowed_nis import WindowedNIS
 from vcjax.simulation.scenarios import paper
 from vcjax.storage import remove_leftovers, write_file
 from vcjax.study.monte_carlo import monte_carlo
@@ -35,6 +41,15 @@ OSCILLATION_AMPLITUDE_M = 0.05
 """A of the paper's oscillating camera (Table 1)."""
 GATES: Mapping[str, Callable[[], AbstractGate]] = {"RE": ReprojectionError, "VC": VirtualCorrection}
 """The gates by their names in the paper."""
+DETECTORS: Mapping[str, Callable[[], AbstractDetector]] = {
+    "inlier_ratio": InlierRatio,
+    "velocity_glr": VelocityGLR,
+    "velocity_likelihood_ratio": VelocityLikelihoodRatio,
+    "windowed_nis": WindowedNIS,
+    "cusum": Cusum,
+    "immediate": Immediate,
+}
+"""The detectors by name; the paper's toolbox has the first."""
 
 Block = tuple[Cell, int, int]
 """Cell, first seed and end of the seeds."""

@@ -24,7 +24,7 @@ from vcjax.simulation.simulate import simulate
 from vcjax.storage import replacing
 from vcjax.study.sweep import Experiment
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of the layout of results, raised when an older reader would misread them."""
 
 PER_FRAME = {
@@ -49,10 +49,12 @@ PER_FEATURE = {
     "first_mapped": "first frame a feature was in the map; 0: never",
     "first_deleted": "first frame it was deleted by gate or detector; 0: never",
     "dynamic_margin": "how dynamic it ever looked to the gate, χ² units; NaN: never a measured candidate",
+    "detector_margin": "how dynamic it ever looked to the detector, χ² units; NaN: it never had anything to say",
 }
 PER_RUN = {
     "is_finite": "whether all numbers of the run stayed finite",
     "detection_auc": "share of pairs of a mover and another feature that dynamic_margin puts in the right order",
+    "detector_auc": "share of pairs of a mover and another feature that detector_margin puts in the right order",
     "map_full_frames": "frames in which a feature had to wait for a free slot",
 }
 
