@@ -25,6 +25,8 @@ COVARIANCE_TOLERANCE = 1e-5
 class Frame(eqx.Module):
     """One frame of a recording: the odometry that led to it and the features seen in it."""
 
+    time_step_s: Float[Array, ""]
+    """Time since the frame before, s; 0 in the first."""
     odometry: Float[Array, "6"]
     odometry_cov: Float[Array, "6 6"]
     sensor_shift_m: Float[Array, "3"]
@@ -72,10 +74,19 @@ class Recording(eqx.Module):
         """T, the number of frames."""
         return self.odometry.shape[-2]
 
+    @property
+    def time_step_s(self) -> Float[Array, " T"]:
+        """Time since the frame before, s; 0 in the first."""
+        return jnp.diff(jnp.asarray(self.time_s), prepend=jnp.asarray(self.time_s)[:1])
+
     def frame(self, t: int | Int[Array, ""]) -> Frame:
         """Frame t, 0 ≤ t < T."""
         per_frame = (f.name for f in dataclasses.fields(Frame) if f.name != "camera")
         return Frame(camera=self.camera, **{name: jnp.asarray(getattr(self, name))[t] for name in per_frame})
+
+
+PER_FRAME = ("time_s", "odometry", "odometry_cov", "sensor_shift_m", "track_id", "uv_px", "is_valid", "is_last")
+"""Fields of a recording that have a row for each frame."""
 
 
 class Truth(eqx.Module):

@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from vcjax.fields import number, require, require_choice, require_count, require_key, require_kind, require_single
+from vcjax.filter.motion_model import AbstractMotion, Odometry
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.surrogates import SMOOTHINGS, Smoothing
@@ -24,6 +25,9 @@ class FilterConfig(eqx.Module):
     detector: AbstractDetector = eqx.field(default_factory=InlierRatio)
     """Which landmarks are deleted over time."""
 
+    motion: AbstractMotion = eqx.field(default_factory=Odometry)
+    """What leads the robot from frame to frame."""
+
     max_landmarks: int = eqx.field(static=True, default=107)
     """Landmark slots. A full map is reported, and no feature is born until a slot is free. The paper's scenarios need
     94; with a spare one, 108 are 9 tiles of 12 (see `map_covariance`)."""
@@ -35,6 +39,14 @@ class FilterConfig(eqx.Module):
     """Features initialised in every other frame (Table 1: 1)."""
     update: Literal["sequential", "stacked"] = eqx.field(static=True, default="sequential")
     """Correct one landmark after another, each re-linearised at the state left by the one before; or all at once."""
+    errors: Literal["additive", "invariant"] = eqx.field(static=True, default="additive")
+    """What the covariance is of: differences, as in the paper; or errors that turn robot and map together, for long
+    paths without a known heading (see `invariant`)."""
+    order: Literal["most_uncertain", "consensus"] = eqx.field(static=True, default="most_uncertain")
+    """In which order the chosen are corrected with: the most uncertain first, as in the paper; or first those that
+    agree with each other, for recordings with outliers and poor odometry (see `consensus`)."""
+    iterations: int = eqx.field(static=True, default=1)
+    """How often a sequential correction is linearised; 1: once, at the state before it, as the paper does."""
     choose_among: Literal["predicted", "measured"] = eqx.field(static=True, default="predicted")
     """Choose the most uncertain among those predicted visible (one then not measured has used up its place), or among
     those that also were measured."""
@@ -83,6 +95,8 @@ class FilterConfig(eqx.Module):
         require_kind("FilterConfig", "gate", self.gate, AbstractGate, gates)
         detectors = "give a detector, e.g. InlierRatio(), or InlierRatio(min_searches=inf) to delete nothing."
         require_kind("FilterConfig", "detector", self.detector, AbstractDetector, detectors)
+        motions = "give a motion model, e.g. Odometry() or ConstantVelocity()."
+        require_kind("FilterConfig", "motion", self.motion, AbstractMotion, motions)
         for name in ("temperature", "pixel_std_px", "inverse_depth_mean", "inverse_depth_std", "inverse_depth_min"):
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
         for name in ("oscillation_std_m", "linearity_max", "birth_margin_px"):
