@@ -64,7 +64,9 @@ def head(recording: Recording, num_frames: int) -> Recording:
 
 def frame_of(recording: Recording, t: int) -> Frame:
     """Frame t. Cut out before it goes to the device, so that recordings of all lengths share what that compiles."""
-    return part(recording, t, t + 1).frame(0)
+    frame = part(recording, t, t + 1).frame(0)
+    step_s = recording.time_s[t] - recording.time_s[t - 1] if t else 0.0
+    return dataclasses.replace(frame, time_step_s=jnp.asarray(step_s, frame.time_step_s.dtype))
 
 
 def filtered(

@@ -147,9 +147,9 @@ def test_a_gap_in_time_widens_the_doubt_as_frames_without_features_do():
     [
         (lambda: ConstantVelocity(acceleration=-1.0), r"ConstantVelocity\(acceleration=-1.0\)"),
         (lambda: BiasedOdometry(rate_bias_walk=np.nan), r"BiasedOdometry\(rate_bias_walk=nan\)"),
-        (lambda: FilterConfig(motion="odometry"), r"FilterConfig\(motion='odometry'\)"),
+        (lambda: FilterConfig(motion="odometry"), r"FilterConfig\(motion='odometry'\)"),  # type: ignore
     ],
 )
-def test_bad_numbers_are_refused(make, message):
+def test_bad_numbers_are_refused(make, message, unchecked):
     with pytest.raises(ValueError, match=message):
         make()

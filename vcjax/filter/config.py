@@ -101,13 +101,15 @@ class FilterConfig(eqx.Module):
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
         for name in ("oscillation_std_m", "linearity_max", "birth_margin_px"):
             require(self, name, lambda v: np.isfinite(v) & (v >= 0), "give a number of at least 0.")
-        for name in ("max_landmarks", "max_updates"):
+        for name in ("max_landmarks", "max_updates", "iterations"):
             require_count(self, name, 1)
         for name in ("births_first_frame", "births_per_frame", "blacklist_capacity"):
             require_count(self, name, 0)
         for name, choices in (
             ("update", ("sequential", "stacked")),
             ("smoothing", SMOOTHINGS),
+            ("errors", ("additive", "invariant")),
+            ("order", ("most_uncertain", "consensus")),
             ("choose_among", ("predicted", "measured")),
             ("birth_order", ("lowest_id", "random")),
             ("skip_free_slots", (None, True, False)),
@@ -118,6 +120,11 @@ class FilterConfig(eqx.Module):
             raise ValueError(
                 f"FilterConfig(update='stacked', smoothing={self.smoothing!r}): stacked corrections have no smooth "
                 "form; take update='sequential'."
+            )
+        if self.update == "stacked" and (self.order, self.iterations) != ("most_uncertain", 1):
+            raise ValueError(
+                f"FilterConfig(update='stacked', order={self.order!r}, iterations={self.iterations}): corrections at "
+                "once have no order and are linearised once; take update='sequential'."
             )
         if self.max_updates > self.max_landmarks:
             raise ValueError(

@@ -30,6 +30,7 @@ def consensus_order(
     config: FilterConfig, camera: Camera, submap: Submap, uv_px: Float[Array, "K 2"], is_measured: Bool[Array, " K"]
 ) -> Int[Array, " K"]:
     """Candidates in the order to correct with, a permutation; constant under differentiation."""
+    submap, uv_px = jax.lax.stop_gradient((submap, uv_px))
     num = is_measured.shape[0]
     everyone = jnp.arange(num)
     observation = jax.vmap(lambda j: observe(config, camera, block(submap, j)))(everyone)

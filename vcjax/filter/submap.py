@@ -188,10 +188,8 @@ def scatter(
     vehicle, N = normalise(config, vehicle_mean(submap))
     if config.errors == "invariant":
         P_vv, P_vm = state.P_vv - UD_v @ U_v.T, state.P_vm - UD_v @ U
-        A = (
-            turn_of_vehicle(config.motion, submap.shift[:v]),
-            turn_of_landmark(landmarks - state.landmarks).reshape(-1, 3),
-        )
+        A_m = turn_of_landmark(landmarks - state.landmarks).at[slot].set(turn_of_chosen(submap, slots))
+        A = turn_of_vehicle(config.motion, submap.shift[:v]), A_m.reshape(-1, 3)
         E = read_turn(submap.vehicle)
         EPE = E @ P_vv @ E.T
         B = P_vv @ E.T + 0.5 * A[0] @ EPE, P_vm.T @ E.T + 0.5 * A[1] @ EPE
@@ -214,6 +212,17 @@ def scatter(
             _downdate(config, state, V, U),
         ),
     )
+
+
+def turn_of_chosen(submap: Submap, slots: Slots) -> Float[Array, "K 7 3"]:
+    """A of the chosen slots: N(x⁺) - N(x), and of what has become Euclidean what leads from J N(x) to N(p)."""
+    becomes = slots.is_euclidean & ~submap.is_euclidean
+    J = slots.to_coordinates[:, :3]
+    point = jnp.where(becomes[:, None], slots.landmarks, 0.0)
+    anchor = turn_of_landmark(point)[:, :3] - J @ turn_of_landmark(submap.landmarks)
+    converted = jnp.concatenate([anchor, jnp.zeros((len(anchor), SLOT - 3, 3), anchor.dtype)], axis=1)
+    moved = turn_of_landmark(landmark_means(submap) - submap.landmarks)
+    return jnp.where(becomes[:, None, None], converted, moved)
 
 
 def _downdate(
