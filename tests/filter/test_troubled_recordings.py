@@ -5,12 +5,12 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from filter_runs import filtered, frame_of, head, part, recorded, simulate_once, step
+from filter_runs import filtered, frame_of, head, part, recorded, simulate_once, start, step
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.known_landmarks import KnownLandmarks
 from vcjax.filter.motion_model import ConstantVelocity, Odometry
-from vcjax.filter.slam import start as start_unjitted
+from vcjax.filter.slam import run
 from vcjax.recording import PER_FRAME, last_sightings
 from vcjax.simulation.scenarios import paper
 
@@ -83,7 +83,7 @@ def test_wrong_tracks_are_left_out_and_the_run_goes_on(motion):
 
 def test_a_full_map_says_how_many_wait():
     recording = head(recorded(0, robot="curved"), 12)
-    *_, info = infos(config_of("odometry", births_per_frame=4), recording)
+    *_, info = infos(config_of("odometry"), recording)
     visible = set(np.asarray(recording.track_id)[-1][np.asarray(recording.is_valid)[-1]].tolist())
     assert info.map_is_full and 0 < info.num_waiting <= len(visible - set(info.track_id.tolist()))
 
@@ -97,7 +97,7 @@ def test_known_landmarks_give_the_scale():
         config_of("constant velocity", births_per_frame=2, errors="invariant"), max_landmarks=23, max_updates=10
     )
     assert not config.motion.gives_scale
-    state, _ = start_unjitted(config, head(recording, 1), known=known)
+    state, _ = start(config, head(recording, 1), None, known)
     held = np.asarray(state.track_id)[np.asarray(state.track_id) >= 0]
     assert len(np.unique(held)) == len(held) and set(ids) <= set(held)  # none is born a second time
     place = np.asarray(state.landmarks)[:6, :3]
@@ -105,7 +105,7 @@ def test_known_landmarks_give_the_scale():
 
     ends = {}
     for name, points in (("known", known), ("free", None)):
-        state, info = start_unjitted(config, head(recording, 1), known=points)
+        state, info = start(config, head(recording, 1), None, points)
         for t in range(1, recording.num_frames):
             state, info = step(config, state, frame_of(recording, t))
         ends[name] = jax.device_get(info)
@@ -126,4 +126,4 @@ def test_known_landmarks_give_the_scale():
 def test_known_landmarks_that_make_no_map_are_refused(fields, message, unchecked):
     known = KnownLandmarks(np.array([0, 1]), np.zeros((2, 3)), 0.01)._replace(**fields)
     with pytest.raises(ValueError, match=message):
-        start_unjitted(config_of("odometry"), part(recorded(0, robot="curved"), 0, 1), known=known)
+        run(config_of("odometry"), part(recorded(0, robot="curved"), 0, 2), known=known)
