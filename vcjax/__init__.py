@@ -9,10 +9,15 @@ import typing
 
 from vcjax.filter.config import FilterConfig as FilterConfig
 from vcjax.filter.info import FrameInfo as FrameInfo
+from vcjax.filter.known_landmarks import KnownLandmarks as KnownLandmarks
+from vcjax.filter.motion_model import BiasedOdometry as BiasedOdometry
+from vcjax.filter.motion_model import ConstantVelocity as ConstantVelocity
+from vcjax.filter.motion_model import Odometry as Odometry
 from vcjax.filter.slam import run as run
 from vcjax.filter.slam import start as start
 from vcjax.filter.slam import step as step
 from vcjax.filter.state import FilterState as FilterState
+from vcjax.filter.stretches import run_in_stretches as run_in_stretches
 from vcjax.gates.cusum import Cusum as Cusum
 from vcjax.gates.either import Either as Either
 from vcjax.gates.immediate import Immediate as Immediate

@@ -85,6 +85,10 @@ class Recording(eqx.Module):
         return Frame(camera=self.camera, **{name: jnp.asarray(getattr(self, name))[t] for name in per_frame})
 
 
+PER_FRAME = ("time_s", "odometry", "odometry_cov", "sensor_shift_m", "track_id", "uv_px", "is_valid", "is_last")
+"""Fields of a recording that have a row for each frame."""
+
+
 class Truth(eqx.Module):
     """What really happened, known in simulation only."""
 

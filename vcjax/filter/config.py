@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from vcjax.fields import number, require, require_choice, require_count, require_key, require_kind, require_single
+from vcjax.filter.motion_model import AbstractMotion, Odometry
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.surrogates import SMOOTHINGS, Smoothing
@@ -24,6 +25,9 @@ class FilterConfig(eqx.Module):
     detector: AbstractDetector = eqx.field(default_factory=InlierRatio)
     """Which landmarks are deleted over time."""
 
+    motion: AbstractMotion = eqx.field(default_factory=Odometry)
+    """What leads the robot from frame to frame."""
+
     max_landmarks: int = eqx.field(static=True, default=107)
     """Landmark slots. A full map is reported, and no feature is born until a slot is free. The paper's scenarios need
     94; with a spare one, 108 are 9 tiles of 12 (see `map_covariance`)."""
@@ -35,6 +39,14 @@ class FilterConfig(eqx.Module):
     """Features initialised in every other frame (Table 1: 1)."""
     update: Literal["sequential", "stacked"] = eqx.field(static=True, default="sequential")
     """Correct one landmark after another, each re-linearised at the state left by the one before; or all at once."""
+    errors: Literal["additive", "invariant"] = eqx.field(static=True, default="additive")
+    """What the covariance is of: differences, as in the paper; or errors that turn robot and map together, for long
+    paths without a known heading (see `invariant`)."""
+    order: Literal["most_uncertain", "consensus"] = eqx.field(static=True, default="most_uncertain")
+    """In which order the chosen are corrected with: the most uncertain first, as in the paper; or first those that
+    agree with each other, for recordings with outliers and poor odometry (see `consensus`)."""
+    iterations: int = eqx.field(static=True, default=1)
+    """How often a sequential correction is linearised; 1: once, at the state before it, as the paper does."""
     choose_among: Literal["predicted", "measured"] = eqx.field(static=True, default="predicted")
     """Choose the most uncertain among those predicted visible (one then not measured has used up its place), or among
     those that also were measured."""
@@ -90,19 +102,23 @@ class FilterConfig(eqx.Module):
         require_kind("FilterConfig", "gate", self.gate, AbstractGate, gates)
         detectors = "give a detector, e.g. InlierRatio(), or InlierRatio(min_searches=inf) to delete nothing."
         require_kind("FilterConfig", "detector", self.detector, AbstractDetector, detectors)
+        motions = "give a motion model, e.g. Odometry() or ConstantVelocity()."
+        require_kind("FilterConfig", "motion", self.motion, AbstractMotion, motions)
         for name in ("temperature", "pixel_std_px", "inverse_depth_mean", "inverse_depth_std", "inverse_depth_min"):
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
         for name in ("oscillation_std_m", "linearity_max", "birth_margin_px"):
             require(self, name, lambda v: np.isfinite(v) & (v >= 0), "give a number of at least 0.")
         frames = "give a number of frames of at least 0, or infinity: for good."
         require(self, "blacklist_frames", lambda n: n >= 0, frames)
-        for name in ("max_landmarks", "max_updates"):
+        for name in ("max_landmarks", "max_updates", "iterations"):
             require_count(self, name, 1)
         for name in ("births_first_frame", "births_per_frame", "blacklist_capacity"):
             require_count(self, name, 0)
         for name, choices in (
             ("update", ("sequential", "stacked")),
             ("smoothing", SMOOTHINGS),
+            ("errors", ("additive", "invariant")),
+            ("order", ("most_uncertain", "consensus")),
             ("choose_among", ("predicted", "measured")),
             ("birth_order", ("lowest_id", "random")),
             ("skip_free_slots", (None, True, False)),
@@ -113,6 +129,11 @@ class FilterConfig(eqx.Module):
             raise ValueError(
                 f"FilterConfig(update='stacked', smoothing={self.smoothing!r}): stacked corrections have no smooth "
                 "form; take update='sequential'."
+            )
+        if self.update == "stacked" and (self.order, self.iterations) != ("most_uncertain", 1):
+            raise ValueError(
+                f"FilterConfig(update='stacked', order={self.order!r}, iterations={self.iterations}): corrections at "
+                "once have no order and are linearised once; take update='sequential'."
             )
         if self.max_updates > self.max_landmarks:
             raise ValueError(

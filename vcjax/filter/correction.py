@@ -12,18 +12,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.ekf import mahalanobis, whiten, whitener
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.features import observe
+from vcjax.filter.features import Block, move, observe
+from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.reparametrisation import AtCorrection
-from vcjax.filter.state import VEHICLE
 from vcjax.filter.submap import (
     Submap,
     block,
+    block_carry,
     block_columns,
     block_rows,
     first_row,
     landmark_means,
     vehicle_mean,
     weighted,
+    wide,
 )
 from vcjax.models.camera import Camera
 from vcjax.models.landmarks import INVERSE_DEPTH
@@ -49,7 +51,7 @@ class Innovation(NamedTuple):
 class Gain(NamedTuple):
     """What a correction needs beside its innovation."""
 
-    H: Float[Array, "2 21"]
+    H: Float[Array, "2 block"]
     HP: Float[Array, "2 n"]
     """H P."""
     HU: Float[Array, "2 M"]
@@ -59,16 +61,44 @@ class Gain(NamedTuple):
 def innovate(
     config: FilterConfig, camera: Camera, submap: Submap, j: int | Int[Array, ""], uv_px: Float[Array, "2"]
 ) -> tuple[Innovation, Gain]:
-    """Innovation of candidate j at the submap's present state. Equations (8), (9), (13)."""
-    observation = observe(config, camera, block(submap, j))
-    H = observation.H
-    HU = weighted(submap, H @ block_columns(submap.U, j).T)
-    HP = H @ block_rows(submap.P, j) - HU @ submap.U
-    S = block_columns(HP, j) @ H.T + pixel_cov(config, H.dtype)
-    z = uv_px - observation.pixel
-    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible, H[:, VEHICLE:]), Gain(
-        H, HP, HU
-    )
+    """Innovation of candidate j at the submap's present state. Equations (8), (9), (13).
+
+    With `iterations` above 1, of the iterated filter (Gauss–Newton): h is linearised anew where the correction so found
+    would lead to, x + s, and z = y - h(x + s) + H s takes the place of y - h(x). RE₁ is then the least that the state's
+    and the pixel's error have to come up for together, which does not blame the feature for the curvature of h.
+    """
+    present = block(submap, j)
+    innovation, gain = _innovate_at(config, camera, submap, j, uv_px, present, None)
+    for _ in range(config.iterations - 1):
+        W = whitener(innovation.S)
+        shift = whiten(W, block_columns(submap, gain.HP, j)).T @ whiten(W, innovation.z)
+        moved, gain = _innovate_at(config, camera, submap, j, uv_px, present, shift)
+        innovation = moved._replace(is_visible=innovation.is_visible)
+    return innovation, gain
+
+
+def _innovate_at(
+    config: FilterConfig,
+    camera: Camera,
+    submap: Submap,
+    j: int | Int[Array, ""],
+    uv_px: Float[Array, "2"],
+    present: Block,
+    shift: Float[Array, " block"] | None,
+) -> tuple[Innovation, Gain]:
+    """Innovation of candidate j with h linearised at its present block, or at that moved by a shift."""
+    if shift is None:
+        observation = observe(config, camera, present)
+        pixel = observation.pixel
+    else:
+        observation = observe(config, camera, move(present, shift))
+        pixel = observation.pixel - observation.H @ shift
+    H = observation.H if config.errors == "additive" else observation.H @ block_carry(config, submap, j)
+    HU = weighted(submap, H @ block_columns(submap, submap.U, j).T)
+    HP = H @ block_rows(submap, submap.P, j) - HU @ submap.U
+    S = block_columns(submap, HP, j) @ H.T + pixel_cov(config, H.dtype)
+    z = uv_px - pixel
+    return Innovation(pixel, z, S, mahalanobis(z, S), observation.is_visible, H[:, -SLOT:]), Gain(H, HP, HU)
 
 
 def correct_with(
@@ -124,19 +154,18 @@ def correct_stacked(
 
     def measure(j, y, used):
         observation = observe(config, camera, block(submap, j))
-        wide = jnp.zeros((2, size), submap.P.dtype).at[:, :VEHICLE].set(observation.H[:, :VEHICLE])
-        wide = jax.lax.dynamic_update_slice_in_dim(wide, observation.H[:, VEHICLE:], first_row(j), axis=1)
-        return tuple(jnp.where(used, number, 0.0) for number in (observation.H, wide, y - observation.pixel))
+        numbers = (observation.H, wide(submap, j, observation.H), y - observation.pixel)
+        return tuple(jnp.where(used, number, 0.0) for number in numbers)
 
     # A candidate that is not used measures nothing: H = 0, z = 0, and its block of Z is R.
-    H, wide, z = jax.vmap(measure)(jnp.arange(num_candidates), uv_px, is_used)
-    wide, z = wide.reshape(-1, size), z.reshape(-1)
-    HP = wide @ submap.P
+    H, H_wide, z = jax.vmap(measure)(jnp.arange(num_candidates), uv_px, is_used)
+    H_wide, z = H_wide.reshape(-1, size), z.reshape(-1)
+    HP = H_wide @ submap.P
     R = jnp.kron(jnp.eye(num_candidates, dtype=HP.dtype), pixel_cov(config, HP.dtype))
-    L = jnp.linalg.cholesky(HP @ wide.T + R)
+    L = jnp.linalg.cholesky(HP @ H_wide.T + R)
     T = jax.scipy.linalg.solve_triangular(L, jnp.eye(len(L), dtype=L.dtype), lower=True)
     U, w = T @ HP, T @ z
-    vehicle_before = jnp.broadcast_to(vehicle_mean(submap), (num_candidates, VEHICLE))
+    vehicle_before = jnp.broadcast_to(vehicle_mean(submap), (num_candidates, *submap.vehicle.shape))
     moved = eqx.tree_at(lambda s: (s.shift, s.U, s.H, s.T, s.w), submap, (submap.shift + U.T @ w, U, H, T, w))
     variance = _inverse_depth_variance(moved, jnp.arange(num_candidates))
     at_correction = AtCorrection(landmark_means(moved), variance, vehicle_before)
@@ -145,7 +174,7 @@ def correct_stacked(
 
 def _inverse_depth_variance(submap: Submap, j: int | Int[Array, "*j"]) -> Float[Array, "*j"]:
     """Current variance of the last error coordinate of candidate j."""
-    last = first_row(j) + INVERSE_DEPTH
+    last = first_row(submap, j) + INVERSE_DEPTH
     return submap.P[last, last] - jnp.sum(weighted(submap, submap.U[:, last].T ** 2), axis=-1)
 
 

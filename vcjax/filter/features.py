@@ -17,11 +17,11 @@ from vcjax.recording import Frame
 
 
 class Block(NamedTuple):
-    """Mean of the 21 coordinates that a landmark's measurement depends on."""
+    """Mean of vehicle and landmark: all that a measurement of it depends on."""
 
-    vehicle: Float[Array, "14"]
-    landmark: Float[Array, "7"]
-    to_coordinates: Float[Array, "7 7"]
+    vehicle: Float[Array, "*b v"]
+    landmark: Float[Array, "*b 7"]
+    to_coordinates: Float[Array, "*b 7 7"]
 
 
 NEAR_PX = 64.0
@@ -36,7 +36,7 @@ class Observation(NamedTuple):
     """Inside the image and in front of the camera."""
     is_near: Bool[Array, "*b"]
     """Visible or almost so: at most `NEAR_PX` outside the image."""
-    H: Float[Array, "*b 2 21"]
+    H: Float[Array, "*b 2 n"]
     """Derivative of the pixel by the errors of vehicle and slot."""
 
 
@@ -47,11 +47,12 @@ def observe(config: FilterConfig, camera: Camera, block: Block) -> Observation:
     makes h blind to their length, and they are normalised once, at the end of the frame.
     """
     robot, robot_H = _unit_pose(config, block.vehicle[:7])
-    sensor, sensor_H = _unit_pose(config, block.vehicle[7:])
+    sensor, sensor_H = _unit_pose(config, block.vehicle[7:VEHICLE])
     pixel, depth, U_r, U_s, U_l = project_landmark(camera, robot, sensor, block.landmark)
-    H = jnp.concatenate(
-        [U_r[:, :3], U_r[:, 3:] @ robot_H, U_s[:, :3], U_s[:, 3:] @ sensor_H, U_l @ block.to_coordinates], axis=1
-    )
+    parts = [U_r[:, :3], U_r[:, 3:] @ robot_H, U_s[:, :3], U_s[:, 3:] @ sensor_H, U_l @ block.to_coordinates]
+    if num_carried := block.vehicle.shape[0] - VEHICLE:  # what the motion model carries, no pixel shows
+        parts.insert(4, jnp.zeros((2, num_carried), U_l.dtype))
+    H = jnp.concatenate(parts, axis=1)
     # v_z = depth ρ, of the homogeneous point, says where its direction points, whatever the sign of ρ.
     is_in_front = (depth * block.landmark[INVERSE_DEPTH] if config.see_beyond_infinity else depth) > 0
     return Observation(
@@ -59,12 +60,20 @@ def observe(config: FilterConfig, camera: Camera, block: Block) -> Observation:
     )
 
 
-def retract(config: FilterConfig, block: Block, shift: Float[Array, "21"]) -> Block:
+def move(block: Block, shift: Float[Array, " n"]) -> Block:
+    """A block's coordinates moved by its errors."""
+    vehicle_shift, slot_shift = jnp.split(shift, [block.vehicle.shape[0]])
+    return Block(
+        block.vehicle + vehicle_shift, block.landmark + block.to_coordinates @ slot_shift, block.to_coordinates
+    )
+
+
+def retract(config: FilterConfig, block: Block, shift: Float[Array, " n"]) -> Block:
     """A block moved by a correction, x + K z (11). An inverse depth that is not positive is set to a small one."""
-    landmark = block.landmark + block.to_coordinates @ shift[VEHICLE:]
-    rho = landmark[INVERSE_DEPTH]
-    landmark = landmark.at[INVERSE_DEPTH].set(jnp.where(rho > 0, rho, config.inverse_depth_min))
-    return Block(block.vehicle + shift[:VEHICLE], landmark, block.to_coordinates)
+    moved = move(block, shift)
+    rho = moved.landmark[INVERSE_DEPTH]
+    landmark = moved.landmark.at[INVERSE_DEPTH].set(jnp.where(rho > 0, rho, config.inverse_depth_min))
+    return moved._replace(landmark=landmark)
 
 
 def measurement_model(config: FilterConfig, camera: Camera) -> MeasurementModel:
@@ -102,23 +111,23 @@ def predict_features(config: FilterConfig, state: FilterState, camera: Camera) -
     # A free slot may hold anything: it is measured as a harmless point, so that no NaN arises where nothing is.
     harmless = jnp.array([0, 0, 0, 1, 0, 0, 1], state.landmarks.dtype)
     landmarks = jnp.where(is_mapped[:, None], state.landmarks, harmless)
-    blocks = Block(jnp.broadcast_to(state.vehicle, (num_slots, VEHICLE)), landmarks, state.to_coordinates)
+    blocks = Block(jnp.broadcast_to(state.vehicle, (num_slots, *state.vehicle.shape)), landmarks, state.to_coordinates)
     observation = jax.vmap(lambda block: observe(config, camera, block))(blocks)
 
     uncertainty = _uncertainty(observation.H, state)
     return Prediction(is_mapped & observation.is_visible, is_mapped & observation.is_near, uncertainty)
 
 
-def _uncertainty(H: Float[Array, "L 2 21"], state: FilterState) -> Float[Array, " L"]:
+def _uncertainty(H: Float[Array, "L 2 n"], state: FilterState) -> Float[Array, " L"]:
     """det(H P Hᵀ) of every slot.
 
     With H = [H_v H_l], H P Hᵀ = H_v P_vv H_vᵀ + X H_lᵀ + H_l Xᵀ where X = H_v P_vl + ½ H_l P_ll. The sums over the
     short axes of X are written out: on a CPU that takes a third of the time of a batch of small matrix products.
     """
     num_slots = H.shape[0]
-    H_v, H_l = H[..., :VEHICLE], H[..., VEHICLE:]
-    P_vl, P_ll = state.P_vm.reshape(VEHICLE, num_slots, SLOT), 0.5 * slot_blocks(state.P_mm)
-    HP_vv = (H_v.reshape(-1, VEHICLE) @ state.P_vv).reshape(H_v.shape)
+    H_v, H_l = H[..., :VEHICLE], H[..., -SLOT:]
+    P_vl, P_ll = state.P_vm[:VEHICLE].reshape(VEHICLE, num_slots, SLOT), 0.5 * slot_blocks(state.P_mm)
+    HP_vv = (H_v.reshape(-1, VEHICLE) @ state.P_vv[:VEHICLE, :VEHICLE]).reshape(H_v.shape)
     X = jnp.zeros((num_slots, 2, SLOT), H.dtype)
     for v in range(VEHICLE):
         X += H_v[:, :, v, None] * P_vl[v, :, None]

@@ -1,7 +1,10 @@
 """FrameInfo: what a person wants to see of a frame, and the next frame does not need."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from vcjax.filter.landmark_points import LandmarkPoints
 
 
 class FrameInfo(eqx.Module):
@@ -11,6 +14,10 @@ class FrameInfo(eqx.Module):
     """Robot and sensor pose at the end of the frame."""
     vehicle_cov: Float[Array, "14 14"]
     """Their covariance."""
+    carried: Float[Array, "*T c"]
+    """What the motion model carries (see `motion_model`), e.g. a twist: nothing with plain odometry."""
+    carried_std: Float[Array, "*T c"]
+    """Standard deviation of each."""
     candidate_id: Int[Array, " K"]
     """Feature of each candidate for update, most uncertain first; -1 where there was none."""
     is_measured: Bool[Array, " K"]
@@ -52,11 +59,22 @@ class FrameInfo(eqx.Module):
     """Features deleted by the detector; -1 elsewhere."""
     born_id: Int[Array, " births"]
     """Features initialised; -1 for an attempt without a birth."""
+    departed: LandmarkPoints
+    """Landmarks that left the map in this frame, as they were after its corrections: deleted by gate or detector (see
+    `is_dynamic`, `inconsistent_id`), or else retired, their feature never being seen again. With them and
+    `landmark_points` of the last state the map is whole."""
     track_id: Int[Array, " L"]
     """Feature held by each slot at the end of the frame; -1 where free."""
     num_coordinates: Int[Array, ""]
-    """N, the length of the state at the end of the frame: 14, and 7 (AHP) or 3 (Euclidean) for each landmark."""
+    """N, the length of the state at the end of the frame: vehicle, and 7 (AHP) or 3 (Euclidean) for each landmark."""
     map_is_full: Bool[Array, ""]
     """Whether a feature waits for a free slot."""
+    num_waiting: Int[Array, ""]
+    """How many: measured features that could be born but for that."""
     is_finite: Bool[Array, ""]
     """Whether the vehicle's mean and covariance are finite numbers."""
+
+    @property
+    def is_blind(self) -> Bool[Array, ""]:
+        """Whether no pixel corrected the state: it follows its motion alone, and its covariance grows."""
+        return ~jnp.any(self.is_accepted | self.is_recovered, axis=-1)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.map_covariance import SLOT
-from vcjax.filter.state import FREE, FilterState
+from vcjax.filter.state import FREE, VEHICLE, FilterState
 from vcjax.models.camera import is_inside
 from vcjax.models.landmarks import INVERSE_DEPTH, back_project_landmark
 from vcjax.recording import Frame
@@ -50,7 +50,7 @@ def ban(config: FilterConfig, state: FilterState, is_banned: Bool[Array, " L"]) 
 
 def give_birth(
     config: FilterConfig, state: FilterState, frame: Frame, is_mapped: Bool[Array, " V"], num_births: int
-) -> tuple[FilterState, Int[Array, " births"], Bool[Array, ""]]:
+) -> tuple[FilterState, Int[Array, " births"], Int[Array, ""]]:
     """Initialise up to `num_births` new landmarks from features that are not in the map. Paper's Table 1.
 
     Eligible are measured features at least `birth_margin_px` inside the image and not on the blacklist; lowest id
@@ -63,8 +63,8 @@ def give_birth(
         is_mapped: which of them the map holds already.
         num_births: static number of attempts.
 
-    Returns: the state, the ids of those born (-1 for an attempt without a birth), and whether a feature had to wait
-    because the map is full.
+    Returns: the state, the ids of those born (-1 for an attempt without a birth), and how many features have to
+    wait because the map is full.
     """
     is_eligible = frame.is_valid & ~is_mapped & is_inside(frame.camera, frame.uv_px, config.birth_margin_px)
     is_eligible &= ~jnp.any(frame.track_id[:, None] == state.blacklist, axis=1)
@@ -83,7 +83,8 @@ def give_birth(
         return (state, is_eligible.at[column].set(is_eligible[column] & ~is_born)), born_id
 
     (state, is_waiting), born = jax.lax.scan(attempt, (state, is_eligible), None, length=num_births)
-    return state, born, jnp.any(is_waiting) & jnp.all(state.is_mapped[: config.max_landmarks])
+    is_full = jnp.all(state.is_mapped[: config.max_landmarks])
+    return state, born, jnp.where(is_full, jnp.sum(is_waiting), 0)
 
 
 def _initialise(
@@ -102,7 +103,7 @@ def _initialise(
 
     def back_project(vehicle, pixel):
         return back_project_landmark(
-            frame.camera, vehicle[:7], vehicle[7:], pixel, config.inverse_depth_mean, config.toolbox_parity
+            frame.camera, vehicle[:7], vehicle[7:VEHICLE], pixel, config.inverse_depth_mean, config.toolbox_parity
         )
 
     landmark = back_project(state.vehicle, uv_px)

@@ -26,7 +26,7 @@ class AtCorrection(NamedTuple):
     """Its mean right after."""
     variance: Float[Array, ""]
     """Variance of its inverse depth right after."""
-    vehicle: Float[Array, "14"]
+    vehicle: Float[Array, " v"]
     """The vehicle right before."""
 
 
@@ -65,9 +65,9 @@ def settle(config: FilterConfig, slots: Slots, at_correction: AtCorrection, is_c
     return jax.vmap(settle_one)(slots, at_correction, is_corrected)
 
 
-def _unit_poses(config: FilterConfig, vehicle: Float[Array, "14"]) -> tuple[Float[Array, "7"], Float[Array, "7"]]:
+def _unit_poses(config: FilterConfig, vehicle: Float[Array, " v"]) -> tuple[Float[Array, "7"], Float[Array, "7"]]:
     """Robot and sensor pose with unit quaternions."""
     robot, sensor = (
-        jnp.concatenate([pose[:3], unit(pose[3:], config.toolbox_parity)]) for pose in (vehicle[:7], vehicle[7:])
+        jnp.concatenate([pose[:3], unit(pose[3:], config.toolbox_parity)]) for pose in (vehicle[:7], vehicle[7:14])
     )
     return robot, sensor

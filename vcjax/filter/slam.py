@@ -6,10 +6,12 @@ detector flagged; retirement of what cannot matter any more; births.
 """
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from vcjax.fields import require_kind
@@ -19,29 +21,47 @@ from vcjax.filter.evidence import evidence_of
 from vcjax.filter.features import choose, match, predict_features
 from vcjax.filter.frame_corrections import correct_frame
 from vcjax.filter.info import FrameInfo
+from vcjax.filter.known_landmarks import KnownLandmarks, check_known, place_known
+from vcjax.filter.landmark_points import landmark_points
 from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.state import FREE, VEHICLE, FilterState, initial_state, slot_count
 from vcjax.filter.submap import gather, normalise, scatter
 from vcjax.gates.surrogates import decide
-from vcjax.models.motion import move_by_odometry
 from vcjax.recording import Frame, Recording, validate
 
 
 def predict(config: FilterConfig, state: FilterState, frame: Frame) -> FilterState:
-    """Prediction: the robot moves by the odometry, the camera by its commanded displacement. Equations (6) and (7).
+    """Prediction: the robot moves as its model says, the camera by its commanded displacement. Equations (6) and (7).
 
-    Only the robot's rows of P change: P_r,all ← F P_r,all, P_rr += F_n N F_nᵀ.
+    Only the rows of P of the robot, and of what the model carries, change: P_r,all ← F P_r,all, P_rr += F_n N F_nᵀ.
     """
-    robot = state.robot
-    F, F_n = jax.jacfwd(move_by_odometry, argnums=(0, 1))(robot, frame.odometry)
-    sensor = state.sensor.at[:3].add(frame.sensor_shift_m)
-    F_v = jnp.eye(VEHICLE, dtype=F.dtype).at[:7, :7].set(F)
+    moving = _moving(state)
+
+    def move(moving: Array, given: Array) -> Array:
+        robot, carried = config.motion.move(moving[:7], moving[7:], given, frame.time_step_s)
+        return jnp.concatenate([robot, carried]) if len(carried) else robot
+
+    given, given_cov = config.motion.input(frame)
+    F, F_n = jax.jacfwd(move, argnums=(0, 1))(moving, given)
+    moved, sensor = move(moving, given), state.sensor.at[:3].add(frame.sensor_shift_m)
+    if len(moving) > 7:
+        rows = np.r_[0:7, VEHICLE : len(state.vehicle)]
+        square = np.ix_(rows, rows)
+    else:
+        rows, square = slice(7), (slice(7), slice(7))
+    F_v = jnp.eye(len(state.vehicle), dtype=F.dtype).at[square].set(F)
     P_vv = F_v @ state.P_vv @ F_v.T
-    P_vv = P_vv.at[:7, :7].add(F_n @ frame.odometry_cov @ F_n.T)
+    P_vv = P_vv.at[square].add(F_n @ given_cov @ F_n.T)
     P_vv = P_vv.at[8, 8].add(config.oscillation_std_m**2)  # the lateral axis, y, of the sensor's position
-    P_vm = state.P_vm.at[:7].set(F @ state.P_vm[:7])
-    vehicle = jnp.concatenate([move_by_odometry(robot, frame.odometry), sensor])
+    P_vm = state.P_vm.at[rows].set(F @ state.P_vm[rows])
+    vehicle = jnp.concatenate([moved[:7], sensor, moved[7:]] if len(moving) > 7 else [moved, sensor])
     return eqx.tree_at(lambda s: (s.vehicle, s.P_vv, s.P_vm), state, (vehicle, P_vv, P_vm))
+
+
+def _moving(state: FilterState) -> Array:
+    """Robot pose and what the motion model carries."""
+    carried = state.vehicle[VEHICLE:]
+    return jnp.concatenate([state.robot, carried]) if len(carried) else state.robot
 
 
 def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[FilterState, FrameInfo]:
@@ -85,7 +105,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     is_flagged = margin > 0
     state = eqx.tree_at(lambda s: s.detector, state, detector)
 
-    info_of_candidates = dict(
+    info_of_candidates: dict[str, Any] = dict(
         candidate_id=jnp.where(is_searched, state.track_id[slot], FREE),
         is_measured=is_measured,
         pixel=innovation.pixel,
@@ -106,9 +126,11 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         inconsistent_id=jnp.where(is_flagged, state.track_id, FREE),
     )
     is_deleted = is_dynamic | is_flagged
+    before = state
     state = landmark_map.delete(landmark_map.ban(config, state, is_deleted), is_deleted)
     if config.retire:
         state = landmark_map.retire(config, state, prediction.is_near)
+    info_of_candidates["departed"] = landmark_points(before, ~state.is_mapped)
     has_ended = state.has_ended | (frame.is_last[column] & (column >= 0))
     state = eqx.tree_at(lambda s: s.has_ended, state, has_ended)
     num_features = frame.is_valid.shape[0]
@@ -144,22 +166,32 @@ def _check_step(config: FilterConfig, state: FilterState, frame: Frame) -> None:
             raise ValueError(f"step(frame.{name}) has shape {found}, but {shape} is needed: one row for each track_id.")
 
 
-def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None) -> tuple[FilterState, FrameInfo]:
+def start(
+    config: FilterConfig,
+    recording: Recording,
+    key: PRNGKeyArray | None = None,
+    known: KnownLandmarks | None = None,
+) -> tuple[FilterState, FrameInfo]:
     """The first frame of a recording: its odometry, and the first births into the empty map.
 
     Args:
         config: filter configuration.
         recording: what the run reads.
         key: for a random order of births, and only then.
+        known: landmarks that are in the map from the start.
 
     Returns: the state after the first frame, and its info.
 
     Raises:
-        ValueError: for a recording that no filter can run on (see `recording.validate`).
+        ValueError: for a recording that no filter can run on (see `recording.validate`), or known landmarks that make
+            no map.
     """
     check_arguments("start", config, key)
     validate(recording)
     state = initial_state(config, recording, key)
+    if known is not None:
+        check_known(config, known)
+        state = place_known(state, known)
     frame = recording.frame(0)
     state = predict(config, state, frame)
     # The start's covariance may hold variance along a quaternion, which births must not see.
@@ -167,7 +199,7 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
     state = eqx.tree_at(lambda s: (s.vehicle, s.P_vv), state, (vehicle, N @ state.P_vv @ N.T))
     K, L, dtype = config.max_updates, slot_count(config), state.P_vv.dtype
     nobody, nothing = jnp.zeros(K, bool), jnp.full(K, jnp.nan, dtype)
-    info_of_candidates = dict(
+    info_of_candidates: dict[str, Any] = dict(
         candidate_id=jnp.full(K, FREE, jnp.int32),
         is_measured=nobody,
         pixel=jnp.zeros((K, 2), dtype),
@@ -187,7 +219,8 @@ def start(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None =
         p_detector=jnp.zeros(L, dtype),
         inconsistent_id=jnp.full(L, FREE, jnp.int32),
     )
-    is_mapped = jnp.zeros_like(frame.is_valid)
+    info_of_candidates["departed"] = landmark_points(state, jnp.zeros_like(state.is_mapped))
+    is_mapped = jnp.zeros_like(frame.is_valid) if known is None else jnp.isin(frame.track_id, known.track_id)
     return _finish(config, state, frame, is_mapped, config.births_first_frame, info_of_candidates)
 
 
@@ -197,45 +230,58 @@ def _finish(
     frame: Frame,
     is_mapped: Bool[Array, " V"],
     num_births: int,
-    info_of_candidates: dict[str, Array],
+    info_of_candidates: dict[str, Any],
 ) -> tuple[FilterState, FrameInfo]:
     """Births, and the frame's info."""
-    state, born, is_full = landmark_map.give_birth(config, state, frame, is_mapped, num_births)
+    state, born, num_waiting = landmark_map.give_birth(config, state, frame, is_mapped, num_births)
     attempts = max(config.births_first_frame, config.births_per_frame)
     info = FrameInfo(
-        vehicle=state.vehicle,
-        vehicle_cov=state.P_vv,
+        vehicle=state.vehicle[:VEHICLE],
+        vehicle_cov=state.P_vv[:VEHICLE, :VEHICLE],
+        carried=state.vehicle[VEHICLE:],
+        carried_std=jnp.sqrt(jnp.diagonal(state.P_vv)[VEHICLE:]),
         born_id=jnp.full(attempts, FREE, born.dtype).at[:num_births].set(born),
         track_id=state.track_id,
-        num_coordinates=VEHICLE + jnp.sum(jnp.where(state.is_mapped, jnp.where(state.is_euclidean, 3, SLOT), 0)),
-        map_is_full=is_full,
+        num_coordinates=len(state.vehicle)
+        + jnp.sum(jnp.where(state.is_mapped, jnp.where(state.is_euclidean, 3, SLOT), 0)),
+        map_is_full=num_waiting > 0,
+        num_waiting=num_waiting,
         is_finite=jnp.all(jnp.isfinite(state.vehicle)) & jnp.all(jnp.isfinite(state.P_vv)),
         **info_of_candidates,
     )
     return state, info
 
 
-def run(config: FilterConfig, recording: Recording, key: PRNGKeyArray | None = None) -> tuple[FilterState, FrameInfo]:
+def run(
+    config: FilterConfig,
+    recording: Recording,
+    key: PRNGKeyArray | None = None,
+    known: KnownLandmarks | None = None,
+) -> tuple[FilterState, FrameInfo]:
     """Filter a whole recording.
 
     Args:
         config: filter configuration.
         recording: T frames.
         key: for a random order of births, and only then.
+        known: landmarks that are in the map from the start.
 
     Returns: the final state, and the info of every frame (leading axis T).
 
     Raises:
-        ValueError: for a recording that no filter can run on (see `recording.validate`), before anything compiles.
+        ValueError: for a recording that no filter can run on (see `recording.validate`), or known landmarks that make
+            no map, before anything compiles.
     """
     check_arguments("run", config, key)
     validate(recording)
-    return _run(config, recording, key)
+    if known is not None:
+        check_known(config, known)
+    return _run(config, recording, key, known)
 
 
 @jax.jit
-def _run(config, recording, key):
-    state, first = start(config, recording, key)
+def _run(config, recording, key, known):
+    state, first = start(config, recording, key, known)
 
     def advance(state, t):
         return step(config, state, recording.frame(t))

@@ -23,10 +23,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.map_covariance import SLOT, SLOTS_PER_BLOCK, slot_blocks, symmetric
 from vcjax.models.frames import unit
-from vcjax.recording import Recording
+from vcjax.recording import AnyArray, Recording
 
 VEHICLE = 14
-"""Error coordinates of robot and sensor."""
+"""Error coordinates of robot and sensor; the motion model may add some of its own behind them."""
 FREE = -1
 """Track id of a free slot."""
 
@@ -34,15 +34,16 @@ FREE = -1
 class FilterState(eqx.Module):
     """State mean x, covariance P and the map's book-keeping."""
 
-    vehicle: Float[Array, "14"]
-    """Robot pose T_w_r (7) and sensor pose T_r_s (7). Quaternions are of unit length between frames."""
+    vehicle: Float[Array, " v"]
+    """Robot pose T_w_r (7), sensor pose T_r_s (7), and what the motion model carries. Quaternions are of unit length
+    between frames."""
     landmarks: Float[Array, "L 7"]
     """Landmark means, AHP or Euclidean in the common form (see `models.landmarks`)."""
     to_coordinates: Float[Array, "L 7 7"]
     """Derivative of a landmark's coordinates by its slot's error coordinates: I for AHP, [J; 0] for Euclidean."""
-    P_vv: Float[Array, "14 14"]
+    P_vv: Float[Array, "v v"]
     """Covariance of the vehicle, [P_rr P_rs; P_sr P_ss]."""
-    P_vm: Float[Array, "14 M"]
+    P_vm: Float[Array, "v M"]
     """Covariance of vehicle with slots' error coordinates, M = 7 L; [P_rm; P_sm]."""
     P_mm: Float[Array, "M M"]
     """Covariance of slots' error coordinates, current on and below the diagonal tiles (see `map_covariance`)."""
@@ -62,7 +63,7 @@ class FilterState(eqx.Module):
     """Key of the random birth order; None where births go by id."""
 
     @property
-    def is_mapped(self) -> Bool[Array, " L"]:
+    def is_mapped(self) -> Bool[AnyArray, " L"]:
         """Which slots hold a landmark."""
         return self.track_id != FREE
 
@@ -74,7 +75,7 @@ class FilterState(eqx.Module):
     @property
     def sensor(self) -> Float[Array, "7"]:
         """Sensor pose T_r_s."""
-        return self.vehicle[7:]
+        return self.vehicle[7:VEHICLE]
 
 
 def slot_count(config: FilterConfig) -> int:
@@ -97,13 +98,19 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
     poses = (jnp.asarray(recording.robot_start), jnp.asarray(recording.sensor_start))
     vehicle = jnp.concatenate([part for pose in poses for part in (pose[:3], unit(pose[3:]))])
     dtype = vehicle.dtype
+    P_vv = jnp.asarray(recording.start_cov, dtype)
+    carried, carried_cov = config.motion.start()
+    if len(carried):
+        vehicle = jnp.concatenate([vehicle, jnp.asarray(carried, dtype)])
+        P_vv = jnp.zeros((len(vehicle), len(vehicle)), dtype).at[:VEHICLE, :VEHICLE].set(P_vv)
+        P_vv = P_vv.at[VEHICLE:, VEHICLE:].set(carried_cov)
     size = SLOT * num_slots
     return FilterState(
         vehicle=vehicle,
         landmarks=jnp.broadcast_to(jnp.array([0, 0, 0, 1, 0, 0, 1], dtype), (num_slots, SLOT)),
         to_coordinates=jnp.broadcast_to(jnp.eye(SLOT, dtype=dtype), (num_slots, SLOT, SLOT)),
-        P_vv=jnp.asarray(recording.start_cov, dtype),
-        P_vm=jnp.zeros((VEHICLE, size), dtype),
+        P_vv=P_vv,
+        P_vm=jnp.zeros((vehicle.shape[0], size), dtype),
         P_mm=jnp.zeros((size, size), dtype),
         track_id=jnp.full(num_slots, FREE, jnp.int32),
         is_euclidean=jnp.zeros(num_slots, bool),
@@ -125,7 +132,7 @@ def full_cov(state: FilterState) -> Float[Array, "N N"]:
     """P whole: vehicle, then the coordinates of every slot. Free slots are zero. Paper equation (3)."""
     num_slots = state.track_id.shape[0]
     T = jnp.where(state.is_mapped[:, None, None], state.to_coordinates, 0.0)
-    P_vm = jnp.einsum("vlj,lij->vli", state.P_vm.reshape(VEHICLE, num_slots, SLOT), T).reshape(VEHICLE, -1)
+    P_vm = jnp.einsum("vlj,lij->vli", state.P_vm.reshape(-1, num_slots, SLOT), T).reshape(len(state.P_vm), -1)
     P_mm = symmetric(state.P_mm).reshape(num_slots, SLOT, num_slots, SLOT)
     P_mm = jnp.einsum("lij,ljmk,mnk->limn", T, P_mm, T)
     size = num_slots * SLOT

@@ -50,6 +50,14 @@ def rotation_matrix(q: Quaternion) -> Float[Array, "3 3"]:
     )
 
 
+def cross_matrix(v: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """[v]×, so that [v]× w = v × w."""
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    zero = jnp.zeros_like(x)
+    rows = ((zero, -z, y), (z, zero, -x), (-y, x, zero))
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def rotate_back_jacobian(q: Quaternion, v: Vector3) -> Float[Array, "3 4"]:
     """∂(R(q)ᵀ v)/∂q, rows x y z, columns w x y z. Equals `jax.jacfwd` of the same product."""
     w, x, y, z = q
