@@ -5,7 +5,7 @@ import io
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import tyro
@@ -13,12 +13,19 @@ from rich.console import Console
 
 from vcjax.commands.bench import Bench
 from vcjax.commands.console import say
+from vcjax.commands.evaluate import Evaluate
+from vcjax.commands.inspect import Inspect
 from vcjax.commands.paper import Report, Reproduce
 from vcjax.commands.run import Run
+from vcjax.commands.simulate import Simulate
 from vcjax.commands.sweep import Sweep
+from vcjax.commands.track import Track
 from vcjax.commands.tune import Tune
 from vcjax.filter.config import FilterConfig
 from vcjax.study.reproduce import GATES
+
+WITHOUT_DEVICES = (Report, Track, Inspect, Evaluate)
+"""Commands that compute nothing in JAX."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         command = _parse(arguments)
-        if not isinstance(command, Report):
+        if not isinstance(command, WITHOUT_DEVICES):
             command.devices.start()
         command(console)
     except (ValueError, OSError, ModuleNotFoundError) as error:
@@ -51,16 +58,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(arguments: list[str]) -> Reproduce | Report | Run | Tune | Sweep | Bench:
+def _parse(arguments: list[str]) -> Any:
     """The command with its options. The gate's own options depend on the gate, so that is looked up first."""
     gate = _gate_name(arguments)
-    default = Run(scenario=tyro.MISSING, config=FilterConfig(gate=GATES[gate]()))
+    config = FilterConfig(gate=GATES[gate]())
+    simulate, run = Simulate(scenario=tyro.MISSING, config=config), Run(recording=tyro.MISSING, config=config)
     union = (
         Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
         | Annotated[Report, tyro.conf.subcommand("report")]
-        | Annotated[Run, tyro.conf.subcommand("run", default=default)]
+        | Annotated[Simulate, tyro.conf.subcommand("simulate", default=simulate)]
         | Annotated[Tune, tyro.conf.subcommand("tune")]
         | Annotated[Sweep, tyro.conf.subcommand("sweep")]
+        | Annotated[Track, tyro.conf.subcommand("track")]
+        | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+        | Annotated[Run, tyro.conf.subcommand("run", default=run)]
+        | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Bench, tyro.conf.subcommand("bench")]
     )
     told = io.StringIO()
