@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 LEFTOVER_AGE_S = 600.0
@@ -45,7 +45,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def filling(folder: str | os.PathLike, last: str, stale: str) -> Iterator[Path]:
+def filling(folder: str | os.PathLike, last: str, stale: Sequence[str]) -> Iterator[Path]:
     """A temporary folder to write files to, which move into `folder` when the block ends; folders are made as needed.
 
     If the block fails, nothing in `folder` changes. Other files in it stay as they are.
@@ -54,7 +54,7 @@ def filling(folder: str | os.PathLike, last: str, stale: str) -> Iterator[Path]:
         folder: where the files go.
         last: the file that says that the others are complete: an old one goes before the first moves, the new one moves
             last, so that files of two writers are never taken for one's.
-        stale: pattern of files of earlier writers that are removed where no new ones replace them.
+        stale: patterns of files of earlier writers that are removed where no new ones replace them.
 
     Raises:
         OSError: if the place cannot be written.
@@ -71,7 +71,7 @@ def filling(folder: str | os.PathLike, last: str, stale: str) -> Iterator[Path]:
         yield temporary
         files = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
         (folder / last).unlink(missing_ok=True)
-        for old in {path.relative_to(folder) for path in folder.glob(stale)} - {*files}:
+        for old in {path.relative_to(folder) for pattern in stale for path in folder.glob(pattern)} - {*files}:
             (folder / old).unlink()
         for file in sorted(files, key=lambda file: file == Path(last)):
             (folder / file).parent.mkdir(parents=True, exist_ok=True)

@@ -42,16 +42,19 @@ class Run:
     """Format of the tables."""
     pictures: int = 8
     """How many frames are drawn by themselves, spread over the recording."""
-    animation: int = 150
-    """Most frames in the animation; 0: none. Of a longer recording every so many-th is drawn."""
+    animation: Literal["gif", "mp4", "none"] = "gif"
+    """An animation of the frames: a GIF, which is seen everywhere, a video (MPEG-4), which is smaller, or none."""
+    animation_frames: int = 100
+    """Most frames in it; of a longer recording every so many-th is drawn."""
     devices: Cores = dataclasses.field(default_factory=Cores)
     """Where the run is done."""
 
     def __call__(self, console: Console) -> None:
         """Read, filter, write, say what came out."""
-        for name in ("pictures", "animation"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"--{name} {getattr(self, name)}: give a whole number of at least 0.")
+        if self.pictures < 0:
+            raise ValueError(f"--pictures {self.pictures}: give a whole number of at least 0.")
+        if self.animation_frames < 1:
+            raise ValueError(f"--animation-frames {self.animation_frames}: give at least 1, or --animation none.")
         out = self.out or Path("results") / f"{self.recording.stem}_{self.gate}"
         check_writable(out / "summary.json")
         content = load_recording(self.recording)
@@ -81,9 +84,9 @@ class Run:
         num_frames = content.recording.num_frames
         for t in _spread(num_frames, self.pictures):
             drawn.write_picture(t, new / "features" / f"{t:06d}.png")
-        if self.animation:
-            frames = range(0, num_frames, -(-num_frames // self.animation))
-            drawn.write_animation(frames, new / "features.gif", progress=show)
+        if self.animation != "none":
+            frames = range(0, num_frames, -(-num_frames // self.animation_frames))
+            drawn.write_animation(frames, new / f"features.{self.animation}", show)
 
 
 def _draw_path(content: RecordingFile, filtered: Filtered, landmarks: LandmarkMap, new: Path) -> None:

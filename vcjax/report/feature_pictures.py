@@ -5,7 +5,9 @@ animated GIF of many frames stays small. The work is Pillow's.
 """
 
 import io
-from collections.abc import Callable, Sequence
+import itertools
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +29,7 @@ _NUM_GREYS = 250
 _COLOURS = [*(CLASS_COLOURS[name] for name in ("accepted", "recovered", "dynamic")), (86, 180, 233), (240, 228, 66)]
 _BLACK, _WHITE = 0, _NUM_GREYS - 1
 _LEGEND_PX = 26
+_GIF_WIDTH_PX, _GIF_GREYS = 640, 24
 
 
 class Seen(NamedTuple):
@@ -85,8 +88,13 @@ class FeaturePictures:
         was_dynamic = np.array([self._ended.get(i, t) < t for i in ids.tolist()], bool)
         return Seen(uv_px, status, was_dynamic)
 
-    def picture(self, t: int, scale: float | None = None) -> Any:
+    def picture(self, t: int, scale: float | None = None, num_greys: int = _NUM_GREYS) -> Any:
         """Frame t as an image of Pillow with a palette.
+
+        Args:
+            t: number of the frame.
+            scale: pixels of the picture for each of the image; so many that it is wide enough if None.
+            num_greys: how many greys the image has.
 
         Raises:
             FileNotFoundError, ValueError: if its image is not there, no image, or of another size.
@@ -100,6 +108,7 @@ class FeaturePictures:
         draw = ImageDraw.Draw(canvas)
         if self.has_images:
             image = pillow.fromarray(self._grey(t)).resize(size, pillow.Resampling.BILINEAR)
+            image = image.point(lambda grey: round(grey * (num_greys - 1) / _WHITE) * _WHITE // (num_greys - 1))
             canvas.paste(image, (0, _LEGEND_PX))
         else:
             _plain_axes(draw, self.size, scale)
@@ -123,36 +132,38 @@ class FeaturePictures:
         return write_file(path, stream.getvalue())
 
     def write_animation(
-        self,
-        frames: Sequence[int],
-        path: Path,
-        width_px: int = 720,
-        progress: Callable[[int, int], None] | None = None,
+        self, frames: Sequence[int], path: Path, progress: Callable[[int, int], None] | None = None
     ) -> Path:
-        """Write frames as an animated GIF that plays over and over, complete or not at all.
+        """Write frames as an animated GIF or a video (MPEG-4), as the ending says, complete or not at all.
 
-        It runs as fast as the recording, at up to 25 pictures per second.
+        It runs as fast as the recording where every frame is drawn, at up to 25 pictures per second. The GIF is at
+        most 640 px wide and has few greys, since it stores every noisy pixel.
 
         Args:
             frames: their numbers, growing.
-            path: of the file.
-            width_px: most width.
+            path: `.gif` or `.mp4`.
             progress: called with (pictures done, in all).
+
+        Raises:
+            ValueError: for another ending.
         """
-        scale = min(float(self.scale), width_px / self.size[0])
-        time_s = np.asarray(self.content.recording.time_s, np.float64)[list(frames)]
-        step_ms = 1000 * float(np.median(np.diff(time_s))) if len(frames) > 1 else 1000.0
+        if path.suffix not in (".gif", ".mp4"):
+            raise ValueError(f"{path}: unknown ending {path.suffix!r}; give .gif or .mp4.")
+        is_gif = path.suffix == ".gif"
+        scale = min(float(self.scale), _GIF_WIDTH_PX / self.size[0]) if is_gif else self.scale
+        time_s = np.asarray(self.content.recording.time_s, np.float64)
+        step_s = max(0.04, float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0)
 
         def pictures():
             for done, t in enumerate(frames, 1):
-                yield self.picture(t, scale)
+                yield self.picture(t, scale, _GIF_GREYS if is_gif else _NUM_GREYS)
                 if progress is not None:
                     progress(done, len(frames))
 
-        images, stream = pictures(), io.BytesIO()
-        options: Any = {"save_all": True, "append_images": images, "duration": max(40, round(step_ms)), "loop": 0}
-        next(images).save(stream, format="GIF", **options)
-        return write_file(path, stream.getvalue())
+        with tempfile.TemporaryDirectory() as folder:
+            temporary = Path(folder) / path.name
+            (_save_gif if is_gif else _save_video)(pictures(), temporary, step_s)
+            return write_file(path, temporary.read_bytes())
 
     def _path(self, t: int) -> Path:
         """The image of frame t; relative paths begin at the recording's folder."""
@@ -165,12 +176,27 @@ class FeaturePictures:
         return (image.astype(np.uint16) * (_NUM_GREYS - 1) // 255).astype(np.uint8)
 
 
+def _save_gif(pictures: Iterator[Any], path: Path, step_s: float) -> None:
+    next(pictures).save(path, save_all=True, append_images=pictures, duration=round(1000 * step_s), loop=0)
+
+
+def _save_video(pictures: Iterator[Any], path: Path, step_s: float) -> None:
+    cv2 = extras.load("cv2", "Videos", "images")
+    first = next(pictures)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 1.0 / step_s, first.size)
+    for picture in itertools.chain([first], pictures):
+        video.write(np.asarray(picture.convert("RGB"))[:, :, ::-1])
+    video.release()
+
+
 def _mark(draw: Any, place: np.ndarray, status: int, was_dynamic: bool) -> None:
-    """A feature: a ring, a cross where rejected, a dot where not used; a square around what was dynamic before."""
+    """A feature: a ring, a disc where dynamic, a cross where rejected, a dot where not used."""
     x, y = (float(p) for p in place)
     colour = _NUM_GREYS + status
     if STATUSES[status] == "not used":
         draw.ellipse((x - 2, y - 2, x + 2, y + 2), fill=colour, outline=_BLACK)
+    elif STATUSES[status] == "dynamic":
+        draw.ellipse((x - 7, y - 7, x + 7, y + 7), fill=colour, outline=_BLACK)
     elif STATUSES[status] == "rejected":
         for width, ink in ((4, _BLACK), (2, colour)):
             draw.line((x - 5, y - 5, x + 5, y + 5), fill=ink, width=width)
@@ -179,7 +205,12 @@ def _mark(draw: Any, place: np.ndarray, status: int, was_dynamic: bool) -> None:
         draw.ellipse((x - 7, y - 7, x + 7, y + 7), outline=_BLACK, width=4)
         draw.ellipse((x - 6, y - 6, x + 6, y + 6), outline=colour, width=2)
     if was_dynamic:
-        draw.rectangle((x - 8, y - 8, x + 8, y + 8), outline=_NUM_GREYS + STATUSES.index("dynamic"), width=1)
+        _square(draw, x, y, 8)
+
+
+def _square(draw: Any, x: float, y: float, half: float) -> None:
+    """Around what was called dynamic before."""
+    draw.rectangle((x - half, y - half, x + half, y + half), outline=_NUM_GREYS + STATUSES.index("dynamic"), width=1)
 
 
 def _legend(draw: Any, width: int, told: str) -> None:
@@ -192,7 +223,7 @@ def _legend(draw: Any, width: int, told: str) -> None:
         _mark(draw, np.array([x, middle]), status, False)
         draw.text((x + 11, middle), name, fill=_BLACK, font=font, anchor="lm")
         x += 11 + draw.textlength(name, font=font) + 18
-    draw.rectangle((x - 6, middle - 6, x + 6, middle + 6), outline=_NUM_GREYS + STATUSES.index("dynamic"), width=1)
+    _square(draw, x, middle, 6)
     draw.text((x + 11, middle), "dynamic before", fill=_BLACK, font=font, anchor="lm")
     draw.text((width - 8, middle), told, fill=_BLACK, font=font, anchor="rm")
 

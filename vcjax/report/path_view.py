@@ -10,8 +10,12 @@ from vcjax.report.style import RC, new_figure
 from vcjax.sources.map_file import CLASS_COLOURS, LandmarkMap
 
 _PATH, _TRUTH, _ODOMETRY = "#0072b2", "#000000", "#999999"
-_MARGIN = 0.35
-"""How far beyond the paths the view reaches, as a part of their extent."""
+_MARGIN = 0.15
+"""How much room the view leaves around what it shows, as a part of its extent."""
+_MOST_ROOM = 2.0
+"""How far beyond the paths it reaches for landmarks, as a multiple of their extent."""
+_WELL_KNOWN = 0.2
+"""Largest standard deviation of a landmark that the view reaches for, as a part of its distance from the middle."""
 _MOST_ELLIPSES = 400
 
 
@@ -24,7 +28,7 @@ def path_figure(
 ) -> Figure:
     """Path (x, y) of the robot, and landmarks in the colours of their classes with 2 σ ellipses.
 
-    The view reaches somewhat beyond the paths: landmarks farther away are left out, and counted below.
+    The view holds the paths and most of the landmarks that are known well; those outside are counted in the title.
 
     Args:
         path: estimated poses.
@@ -34,7 +38,7 @@ def path_figure(
     """
     figure = new_figure(7.2, 6.0)
     axes = figure.subplots()
-    low, high = _view([poses for poses in (path, odometry, truth) if poses is not None])
+    low, high = _view([poses for poses in (path, odometry, truth) if poses is not None], landmarks)
     xy = landmarks.place_m[:, :2]
     is_inside = np.all((xy >= low) & (xy <= high), axis=1)
     kinds = np.array(landmarks.kind, dtype=object)
@@ -59,11 +63,18 @@ def path_figure(
     return figure
 
 
-def _view(paths: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a view that holds the paths, with some room."""
+def _view(paths: list[np.ndarray], landmarks: LandmarkMap) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a view that holds the paths and the landmarks that are known well, up to some distance."""
     xy = np.concatenate([poses[:, :2] for poses in paths])
     xy = xy[np.isfinite(xy).all(axis=1)]
     low, high = xy.min(axis=0), xy.max(axis=0)
+    reach = _MOST_ROOM * float(np.max(high - low))
+    std = np.sqrt(np.linalg.eigvalsh(landmarks.cov[:, :2, :2])[:, -1].clip(min=0.0))
+    distance = np.linalg.norm(landmarks.place_m[:, :2] - (low + high) / 2, axis=1)
+    known = landmarks.place_m[std < _WELL_KNOWN * distance, :2]
+    if len(known):
+        ends = np.quantile(known, [0.05, 0.95], axis=0)
+        low, high = np.minimum(low, ends[0].clip(low - reach)), np.maximum(high, ends[1].clip(max=high + reach))
     room = max(_MARGIN * float(np.max(high - low)), 0.5)
     return low - room, high + room
 

@@ -32,8 +32,10 @@ from vcjax.study.filtered import Filtered
 from vcjax.study.verdicts import VERDICTS, TrackVerdicts, Verdicts, classes
 
 TableFormat = Literal["csv", "parquet"]
+TABLES, ENDINGS = ("landmarks", "verdicts", "tracks"), ("csv", "parquet")
 _MAX_JSON_BYTES = 2**24
 _SUMMARY = "summary.json"
+_STALE = ("features/[0-9]*.png", "features.gif", "features.mp4", *(f"{t}.{e}" for t in TABLES for e in ENDINGS))
 
 
 class RunFolder(NamedTuple):
@@ -82,8 +84,8 @@ def new_run(
 ) -> Iterator[Path]:
     """Write the files of a run into a folder, with those that the block writes into the one that it is given.
 
-    They get to `folder` when the block ends, the summary last. If anything fails what is there stays. Pictures of an
-    earlier run, `features/*.png`, give way.
+    They get to `folder` when the block ends, the summary last. If anything fails what is there stays. Files of an
+    earlier run give way; others stay.
 
     Raises:
         ValueError: if the run has numbers that are not finite.
@@ -96,7 +98,7 @@ def new_run(
         )
     time_s = np.asarray(recording.time_s, np.float64)
     poses = {"robot": robot_poses(filtered.info), "camera": camera_poses(filtered.info)}
-    with filling(folder, last=_SUMMARY, stale="features/[0-9]*.png") as new:
+    with filling(folder, last=_SUMMARY, stale=_STALE) as new:
         for name, T_w_x in poses.items():
             write_tum(new / f"{name}_tum.txt", time_s, T_w_x)
             write_kitti(new / f"{name}_kitti.txt", T_w_x)
@@ -133,8 +135,8 @@ def read_run(folder: str | os.PathLike) -> RunFolder:
         raise ValueError(f"{path}: no summary of a run ({error}).") from error
     time_s, robot = read_tum(folder / "robot_tum.txt")
     kinds: dict[str, Kind] = {"track_id": "whole", **dict.fromkeys(VERDICTS, "whole"), "margin": "real"}
-    endings = [ending for ending in ("csv", "parquet") if (folder / f"tracks.{ending}").is_file()]
-    found = read_table(folder / f"tracks.{summary.get('table', endings and endings[0])}", kinds, undefined=["margin"])
+    paths = [folder / f"tracks.{ending}" for ending in ENDINGS]
+    found = read_table(next((path for path in paths if path.is_file()), paths[0]), kinds, undefined=["margin"])
     for name in ("track_id", *VERDICTS):
         found.refuse_where(found[name] < 0, name, "is below 0")
     found.refuse_where(np.diff(found["track_id"], prepend=-1) <= 0, "track_id", "is not above the one before")

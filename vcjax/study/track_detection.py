@@ -1,10 +1,11 @@
 """How well one run over a labelled recording has told moving tracks from static ones.
 
 Scored are the tracks that are labelled static or moving and of which the gate or the detector had anything to say: what
-was never a candidate cannot be found. Intervals are by bootstrap over tracks, which are taken as independent; tracks on
-one object are not quite, so that they are somewhat narrow.
+was never a candidate cannot be found. Intervals are by bootstrap over tracks, movers and static ones by themselves, as
+if they were independent. Those on one object are not quite, which makes the intervals somewhat narrow.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from vcjax.sources.recording_file import RecordingFile, TrackLabel, TrackLabels
 from vcjax.study import roc
 from vcjax.study.verdicts import TrackVerdicts
 
+_RESAMPLES_AT_ONCE = 50
 Interval = tuple[float, float, float]
 """A figure, and the bounds of its 95 % interval."""
 
@@ -70,14 +72,9 @@ def track_detection(tracks: TrackVerdicts, labels: TrackLabels) -> TrackDetectio
             f1 = np.where(movers > 0, 2 * found / (called + movers), np.nan)
             return np.stack([found / called, found / movers, f1, roc.area(scored, weights)])
 
-    num = len(is_mover)
-    found = figures(np.ones((1, num)))[:, 0]
-    if num:
-        weights = roc.resamples(num)
-        drawn = np.concatenate([figures(weights[i : i + 50]) for i in range(0, len(weights), 50)], axis=1)
-        bounds = roc.interval(drawn.T)
-    else:
-        bounds = np.full((2, 4), np.nan)
+    found = figures(np.ones((1, len(is_mover))))[:, 0]
+    drawn = [figures(weights) for weights in _resamples(is_mover)]
+    bounds = roc.interval(np.concatenate(drawn, axis=1).T)
     intervals: list[Interval] = [
         (float(f), float(low), float(high)) for f, low, high in zip(found, *bounds, strict=True)
     ]
@@ -91,6 +88,17 @@ def track_detection(tracks: TrackVerdicts, labels: TrackLabels) -> TrackDetectio
     )
 
 
+def _resamples(is_mover: np.ndarray) -> Iterator[np.ndarray]:
+    """How often each track is drawn in each resample, some resamples at a time; the same whenever asked."""
+    rng = np.random.default_rng(0)
+    for _ in range(0, roc.NUM_RESAMPLES, _RESAMPLES_AT_ONCE):
+        weights = np.zeros((_RESAMPLES_AT_ONCE, len(is_mover)))
+        for stratum in (is_mover, ~is_mover):
+            if num := int(stratum.sum()):
+                weights[:, stratum] = rng.multinomial(num, np.full(num, 1 / num), _RESAMPLES_AT_ONCE)
+        yield weights
+
+
 def track_detection_text(found: TrackDetection) -> str:
     """The scores in words."""
     rows = [
@@ -99,5 +107,11 @@ def track_detection_text(found: TrackDetection) -> str:
     ]
     for name, label in (("precision", "precision"), ("recall", "recall"), ("f1", "F1"), ("auc", "AUC")):
         value, low, high = getattr(found, name)
-        rows.append((label, f"{value:.3f} (95 %: {low:.3f} to {high:.3f})" if np.isfinite(value) else "not defined"))
+        rows.append((label, _interval(value, low, high)))
     return "\n".join(f"{name:26s} {text}" for name, text in rows)
+
+
+def _interval(value: float, low: float, high: float) -> str:
+    if not np.isfinite(value):
+        return "not defined"
+    return f"{value:.3f}" + (f" (95 %: {low:.3f} to {high:.3f})" if np.isfinite(low + high) else "")

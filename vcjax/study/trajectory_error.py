@@ -82,7 +82,9 @@ def trajectory_error(estimate: Trajectory, truth: Trajectory) -> TrajectoryError
     length = float(true.path_length)
     metrics, units = extras.load("evo.core.metrics", "Evaluations", "images"), _evo("evo.core.units")
     parts = (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg)
-    absolute = {alignment: _absolute(found, true, alignment, parts) for alignment in ALIGNMENTS}
+    absolute: dict[Alignment, AbsoluteError] = {
+        alignment: _absolute(found, true, alignment, parts) for alignment in ALIGNMENTS
+    }
     steps = [metrics.RPE(part, 1, units.Unit.frames) for part in parts]
     for step in steps:
         step.process_data((true, found))
@@ -112,7 +114,12 @@ def trajectory_error_text(found: TrajectoryError) -> str:
     for alignment, error in found.absolute.items():
         scale = f", scale {error.scale:.4g}" if alignment == "similarity" else ""
         text = f"{error.rmse_m:.4g} m RMS (mean {error.mean_m:.4g}, most {error.max_m:.4g}), {error.rmse_deg:.4g}° RMS"
-        rows.append((f"APE, {names[alignment]}", "not determined" if math.isnan(error.rmse_m) else text + scale))
+        rows.append(
+            (
+                f"APE, {names[alignment]}",
+                "not determined: the places lie on a line" if math.isnan(error.rmse_m) else text + scale,
+            )
+        )
     rows.append(("RPE, each step", f"{found.step_rmse_m:.4g} m, {found.step_rmse_deg:.4g}° RMS; not aligned"))
     drift = f"{found.drift_m_per_100_m:.4g} m, {found.drift_deg_per_100_m:.4g}° on average"
     rows.append(("drift per 100 m", f"{drift}, from stretches of {found.stretch_m:.4g} m; not aligned"))
