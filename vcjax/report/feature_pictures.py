@@ -205,7 +205,7 @@ def _mark(draw: Any, place: np.ndarray, status: int, was_dynamic: bool) -> None:
         draw.ellipse((x - 7, y - 7, x + 7, y + 7), outline=_BLACK, width=4)
         draw.ellipse((x - 6, y - 6, x + 6, y + 6), outline=colour, width=2)
     if was_dynamic:
-        _square(draw, x, y, 8)
+        _square(draw, x, y, 8.0)
 
 
 def _square(draw: Any, x: float, y: float, half: float) -> None:
@@ -223,7 +223,7 @@ def _legend(draw: Any, width: int, told: str) -> None:
         _mark(draw, np.array([x, middle]), status, False)
         draw.text((x + 11, middle), name, fill=_BLACK, font=font, anchor="lm")
         x += 11 + draw.textlength(name, font=font) + 18
-    _square(draw, x, middle, 6)
+    _square(draw, x, middle, 6.0)
     draw.text((x + 11, middle), "dynamic before", fill=_BLACK, font=font, anchor="lm")
     draw.text((width - 8, middle), told, fill=_BLACK, font=font, anchor="rm")
 

@@ -74,7 +74,7 @@ def track_detection(tracks: TrackVerdicts, labels: TrackLabels) -> TrackDetectio
 
     found = figures(np.ones((1, len(is_mover))))[:, 0]
     drawn = [figures(weights) for weights in _resamples(is_mover)]
-    bounds = roc.interval(np.concatenate(drawn, axis=1).T)
+    bounds = np.transpose([_bounds(values) for values in np.concatenate(drawn, axis=1)])
     intervals: list[Interval] = [
         (float(f), float(low), float(high)) for f, low, high in zip(found, *bounds, strict=True)
     ]
@@ -97,6 +97,12 @@ def _resamples(is_mover: np.ndarray) -> Iterator[np.ndarray]:
             if num := int(stratum.sum()):
                 weights[:, stratum] = rng.multinomial(num, np.full(num, 1 / num), _RESAMPLES_AT_ONCE)
         yield weights
+
+
+def _bounds(values: np.ndarray) -> np.ndarray:
+    """Bounds of the resampled values, of those that are defined: in a few nobody may have been called dynamic."""
+    values = values[np.isfinite(values)]
+    return roc.interval(values) if len(values) else np.full(2, np.nan)
 
 
 def track_detection_text(found: TrackDetection) -> str:

@@ -9,6 +9,7 @@ world; a wrong scale it sees.
 Sources: Sturm et al., IROS 2012; Grupp 2017, *evo*.
 """
 
+import contextlib
 import copy
 import math
 from typing import Any, Literal, NamedTuple
@@ -22,6 +23,7 @@ Alignment = Literal["none", "first pose", "rigid", "similarity"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "first pose", "rigid", "similarity")
 DRIFT_M = 100.0
 """Length of the stretches over which drift is measured, m, where the path is long enough."""
+_NO_RIGID = "not determined: the places lie on a line"
 MAX_TIME_DIFFERENCE_S = 0.01
 """How far apart the times of a pose and the true pose that it is compared with may be, s."""
 
@@ -117,7 +119,7 @@ def trajectory_error_text(found: TrajectoryError) -> str:
         rows.append(
             (
                 f"APE, {names[alignment]}",
-                "not determined: the places lie on a line" if math.isnan(error.rmse_m) else text + scale,
+                _NO_RIGID if math.isnan(error.rmse_m) else text + scale,
             )
         )
     rows.append(("RPE, each step", f"{found.step_rmse_m:.4g} m, {found.step_rmse_deg:.4g}° RMS; not aligned"))
@@ -149,18 +151,17 @@ def _associated(estimate: Trajectory, truth: Trajectory) -> tuple[Any, Any]:
     poses = [np.array(x.poses, np.float64) for x in (estimate, truth)]
     for i, known in enumerate([np.isfinite(p).all(axis=1) for p in poses]):
         poses[i], times[i] = poses[i][known], times[i][known]
-    found, true = map(make, poses, times)
-    if min(found.num_poses, true.num_poses) >= 2:
-        try:
-            true, found = sync.associate_trajectories(true, found, max_diff=MAX_TIME_DIFFERENCE_S)
-        except sync.SyncException:
-            found = make(np.zeros((0, 7)), np.zeros(0))
-    if min(found.num_poses, true.num_poses) < 2:
-        raise ValueError(
-            f"fewer than two poses have a true one at most {MAX_TIME_DIFFERENCE_S} s away: the estimate is of "
-            f"{_span(times[0])}, the truth of {_span(times[1])}."
-        )
-    return found, true
+    if min(map(len, poses)) >= 2:
+        with contextlib.suppress(sync.SyncException):
+            true, found = sync.associate_trajectories(
+                make(poses[1], times[1]), make(poses[0], times[0]), max_diff=MAX_TIME_DIFFERENCE_S
+            )
+            if found.num_poses >= 2:
+                return found, true
+    raise ValueError(
+        f"fewer than two poses have a true one at most {MAX_TIME_DIFFERENCE_S} s away: the estimate is of "
+        f"{_span(times[0])}, the truth of {_span(times[1])}."
+    )
 
 
 def _span(time_s: np.ndarray) -> str:
