@@ -63,7 +63,7 @@ class FeaturePictures:
         else:
             self.size, self.has_images = (calibration.width, calibration.height), True
             tracks = tracks_of(content.recording, calibration)
-        self.scale = max(1, -(-width_px // self.size[0]))
+        self.scale = float(max(1, -(-width_px // self.size[0])))
         self._tracks, self._passed = tracks, passed
         is_end = (passed.verdict == DYNAMIC) | (passed.verdict > REJECTED)
         # First frame in which each track was called dynamic or deleted.
@@ -150,7 +150,7 @@ class FeaturePictures:
         if path.suffix not in (".gif", ".mp4"):
             raise ValueError(f"{path}: unknown ending {path.suffix!r}; give .gif or .mp4.")
         is_gif = path.suffix == ".gif"
-        scale = min(float(self.scale), _GIF_WIDTH_PX / self.size[0]) if is_gif else self.scale
+        scale = min(self.scale, _GIF_WIDTH_PX / self.size[0]) if is_gif else self.scale
         time_s = np.asarray(self.content.recording.time_s, np.float64)
         step_s = max(0.04, float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0)
 
