@@ -34,8 +34,8 @@ class Evaluate:
         if self.out is not None:
             check_writable(self.out)
         run = read_run(self.estimate) if self.estimate.is_dir() else None
-        estimate = Trajectory(run.robot, run.time_s) if run is not None else _trajectory(self.estimate)
         path = self._truth_path(run)
+        estimate = Trajectory(run.robot, run.time_s) if run is not None else _trajectory(self.estimate)
         content = load_recording(path) if path.suffix.lower() == ".npz" else None
         truth = _trajectory(path) if content is None else _true_path(content)
         parts = []

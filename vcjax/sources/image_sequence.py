@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from vcjax import extras
 from vcjax.recording import Truth
 from vcjax.sources.calibration import Calibration
 from vcjax.sources.front_end import FrontEnd, track_images
@@ -166,8 +167,7 @@ def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height
         FileNotFoundError: if there is no such file.
         ValueError: naming the file, if it is no image, or of another size.
     """
-    import cv2
-
+    cv2 = extras.load("cv2", "Images", "images")
     found = image_size(path)
     if found != (width, height):
         raise ValueError(
@@ -187,14 +187,13 @@ def image_size(path: Path) -> tuple[int, int]:
         FileNotFoundError: if there is no such file.
         ValueError: naming the file, if it is no image.
     """
-    import PIL.Image
-
+    pillow = extras.load("PIL.Image", "Images", "images")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
     try:
-        with PIL.Image.open(path) as image:
+        with pillow.open(path) as image:
             return image.size
-    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError, pillow.DecompressionBombError) as error:
         raise ValueError(f"{path}: no image that can be read ({str(error).splitlines()[0][:100]}).") from error
 
 
