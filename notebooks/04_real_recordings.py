@@ -122,8 +122,9 @@ print(run_summary_text(numbers))
 assert numbers["failures"] == 0 and numbers["frames_map_full"] == 0
 
 # %% [markdown]
-# The mean NIS lies below its band: most innovations are smaller than the half pixel that the filter was told. That is on
-# the safe side, as some corners slide along the edges of patches, and a smaller number would have the gate reject those.
+# The mean NIS lies below its band: most innovations are smaller than the half pixel that the filter was told. That is
+# on the safe side, as some corners slide along the edges of patches, and a smaller number would have the gate reject
+# those.
 
 # %%
 assert numbers["nis"] < numbers["nis_low"]
@@ -150,8 +151,8 @@ figure.savefig(folder / "path.png", dpi=110)
 display(Image(filename=folder / "path.png"))
 
 # %% [markdown]
-# All of this, with the path in the formats of TUM and KITTI, the landmarks as a point cloud and every verdict in a table:
-# `vcjax run recording.npz --choose-among measured --births-per-frame 3 --pixel-std-px 0.5`.
+# All of this, with the path in the formats of TUM and KITTI, the landmarks as a point cloud and every verdict in a
+# table: `vcjax run recording.npz --choose-among measured --births-per-frame 3 --pixel-std-px 0.5`.
 
 # %%
 counts = dict(zip(VERDICTS, tracks.counts.sum(axis=0).tolist(), strict=True))
@@ -162,7 +163,8 @@ assert counts["dynamic"] > 0 and counts["accepted"] > 300
 # ## 5. Against the truth
 #
 # Absolute errors depend on how estimate and truth are laid on each other, and so each way is given, and named. Here
-# both begin at the same known pose: the first line is what counts. `vcjax evaluate results/recording_VC` prints the same.
+# both begin at the same known pose: the first line is what counts. `vcjax evaluate results/recording_VC` prints the
+# same.
 
 # %%
 time_s = np.asarray(content.recording.time_s)
