@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import tiny_runs
 from hypothesis import given
 from hypothesis import strategies as st
+from quick import QUICK
 
 from vcjax.study import descent as module
 from vcjax.study.descent import Schedule, descend, end_of
@@ -120,6 +122,23 @@ def broken_after(num_calls: int, monkeypatch):
         return runs if len(calls) <= num_calls else {name: np.full_like(v, np.nan) for name, v in runs.items()}
 
     monkeypatch.setattr(module, "run_lanes", run_lanes)
+
+
+def test_of_many_parameters_the_derivative_is_taken_in_reverse_mode():
+    """And is that of forward mode."""
+    more = {"config.gate.th2": Interval(0.1, 10.0, is_log=True), "config.pixel_std_px": Interval(0.5, 2.0)}
+    many = problem_of(SCENES, SOFT, PARAMETERS | more, OBJECTIVE)
+    assert many.config.reverse_mode and not PROBLEM.config.reverse_mode
+    forward = eqx.tree_at(lambda p: p.config, many, PROBLEM.config)
+    free = jnp.asarray(many.to_free(START | {"config.gate.th2": 0.7, "config.pixel_std_px": 1.0}))
+    lane, temperature = {"scene": jnp.asarray(0), "sign": jnp.asarray(1.0)}, jnp.asarray(1.0)
+    found, expected = (
+        jax.jit(module._value_and_gradient, compiler_options=QUICK)(problem, free, 0.1 * free, temperature, lane, KEY)
+        for problem in (many, forward)
+    )
+    np.testing.assert_allclose(found["loss"], expected["loss"], rtol=1e-9)
+    np.testing.assert_allclose(found["gradient"], expected["gradient"], rtol=1e-6, atol=1e-9)
+    assert np.all(np.abs(expected["gradient"]) > 1e-6)
 
 
 def test_what_goes_non_finite_is_left_out_and_counted(monkeypatch):

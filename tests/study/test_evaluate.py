@@ -48,6 +48,7 @@ def test_figures_are_those_of_monte_carlo(runs):
         motion = 0.5 * (2 * np.pi * 3.0 * amplitude) ** 2
         loss = 1 - expected.detection_f1 + 2.0 * expected.position_rmse_cm / 100 + 0.5 * motion
         np.testing.assert_allclose(found.loss, loss, rtol=1e-7)
+        np.testing.assert_allclose(found.camera_motion_m2_s2, motion, rtol=1e-6)
 
 
 def test_decisions_are_hard_whatever_the_configuration_says(runs):

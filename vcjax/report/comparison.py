@@ -18,20 +18,22 @@ _DECIMALS = dict.fromkeys((*COMPARED, RECALL), 2) | {
     "detection_auc": 3,
     RECALL: 3,
     "orientation_error_deg": 3,
+    "camera_motion_m2_s2": 3,
 }
 _LABELS = COMPARED | {RECALL: "recall at 1 % static"}
 _TABLES = (
     ("detection_f1", RECALL, "position_rmse_cm"),
     ("dynamic_found_per_run", "static_deleted_per_run", "detection_delay_frames"),
     ("detection_auc", "orientation_error_deg", "anees_position"),
-    ("loss",),
+    ("loss", "camera_motion_m2_s2"),
 )
 _INTRODUCTION = """\
 Hard decisions, {seeds} seeds held out for each scene. Each cell: before → after, and in brackets the 95 % interval of
 the difference, paired by seed; bold where it excludes zero. *F1* = 2 found / (found + static deleted + movers) counts
 the features deleted at least once; *recall at 1 % static* is the share of the movers found if the largest margin of
 each feature is compared with the threshold at which 1 % of the static ones are called dynamic (tracks of all runs
-pooled, bootstrap over seeds); *delay* counts the frames from the birth of a mover to its deletion, where it was found.
+pooled, bootstrap over seeds); *delay* counts the frames from the birth of a mover to its deletion, where it was found;
+*camera motion* is the mean square speed of the swing, (2πfA)²/2.
 """
 
 

@@ -35,6 +35,7 @@ COMPARED = {
     "position_rmse_cm": "position, cm",
     "orientation_error_deg": "orientation, deg",
     "anees_position": "ANEES position",
+    "camera_motion_m2_s2": "camera motion, m²/s²",
 }
 """Figures in which settings are compared, and their labels."""
 RECALL = "recall_at_1_percent_static"

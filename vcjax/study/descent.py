@@ -10,7 +10,7 @@ its whole length, and its loss ripples with f over less than a tenth of a hertz,
 mean over a neighbourhood, E[L(x + ε)] with ε ~ N(0, diag σ²) and a σ for each parameter. Its gradient has two unbiased
 estimates:
 
-    pathwise        ∂L/∂x at x ± ε, in forward mode           sharp where runs change smoothly, as with Th₁, Th₂ and A
+    pathwise        ∂L/∂x at x ± ε                            sharp where runs change smoothly, as with Th₁, Th₂ and A
     of the pair     (L(x + ε) - L(x - ε)) ε / 2σ²             sharp where they ripple, as with f
 
 Both come from the same pair of runs of one seed. Each parameter takes their mean weighted by the inverse of their
@@ -167,7 +167,7 @@ def _value_and_gradient(
     lane: dict[str, Array],
     key: PRNGKeyArray,
 ) -> dict[str, Array]:
-    """Objective of one run of one scene at x ± ε, and its derivative by the free numbers, in forward mode."""
+    """Objective of one run of one scene at x ± ε, and its derivative by the free numbers."""
     scenario = scene(problem.scenes, lane["scene"])
     # A run draws from the folds 0 to 2 of its key.
     shift = spread * jax.random.normal(jax.random.fold_in(key, 3), free.shape, free.dtype)
@@ -182,7 +182,8 @@ def _value_and_gradient(
         value = problem.objective(experiment.scenario, *simulate_and_filter(experiment, key))
         return value, value
 
-    gradient, value = jax.jacfwd(loss, has_aux=True)(free + lane["sign"] * shift)
+    derivative = jax.jacrev if problem.config.reverse_mode else jax.jacfwd
+    gradient, value = derivative(loss, has_aux=True)(free + lane["sign"] * shift)
     return {"loss": value, "gradient": gradient, "shift": shift}
 
 

@@ -21,7 +21,7 @@ from vcjax.fields import require_key, require_kind
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.storage import remove_leftovers
-from vcjax.study.losses import Objective
+from vcjax.study.losses import Objective, camera_motion_m2_s2
 from vcjax.study.metrics import run_metrics
 from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
 from vcjax.study.results import (
@@ -41,7 +41,7 @@ Settings = Mapping[str, Sequence[float] | np.ndarray]
 """Path of a numeric leaf → its value in each setting; all of one length."""
 RUNS_PER_BLOCK = 1024
 """Runs between two files, about: a minute of work, and a bound on memory."""
-_KEPT = ("loss", "dynamic_margin", "is_deleted", "is_moving", "is_finite")
+_KEPT = ("loss", "camera_motion_m2_s2", "dynamic_margin", "is_deleted", "is_moving", "is_finite")
 """What a file of theirs holds at least."""
 
 
@@ -68,8 +68,9 @@ def evaluate(
         directory: where finished blocks are kept, and looked for.
         progress: called with (settings done, settings in all).
 
-    Returns: xarray.Dataset with the dimensions (setting, scene, seed): the figures of `summary.per_run` and the `loss`;
-        by feature as well `dynamic_margin`, `is_deleted` and `is_moving` (see `detection`). The paths are coordinates.
+    Returns: xarray.Dataset with the dimensions (setting, scene, seed): the figures of `summary.per_run`, the `loss`
+        and `camera_motion_m2_s2`; by feature as well `dynamic_margin`, `is_deleted` and `is_moving` (see `detection`).
+        The paths are coordinates.
 
     Raises:
         ValueError: for arguments that make no sense, before anything compiles; or if the directory holds blocks of
@@ -165,10 +166,11 @@ def _run_block(scenarios, config, columns, objective: Objective, num_seeds: int,
     outer = ("setting", "scene", "seed")
     kinds = ((PER_FRAME, "frame"), (PER_FEATURE, "feature"), (PER_RUN, None))
     dims = {name: (*outer, axis) if axis else outer for names, axis in kinds for name in names}
-    dims |= {"is_moving": (*outer, "feature"), "loss": outer}
+    dims |= {"is_moving": (*outer, "feature"), "loss": outer, "camera_motion_m2_s2": outer}
     runs = xr.Dataset({name: (dims[name], found[name]) for name in dims})
     figures = per_run(runs).assign(
         loss=runs.loss.where(runs.is_finite),
+        camera_motion_m2_s2=runs.camera_motion_m2_s2,
         map_full_frames=runs.map_full_frames,
         dynamic_margin=runs.dynamic_margin.where(runs.is_finite),
         is_deleted=(runs.first_deleted > 0) & runs.is_finite,
@@ -183,7 +185,9 @@ def _run_lane(scenes: Scenario, config: FilterConfig, objective: Objective, lane
     values = {path: value for path, value in lane.items() if path != "scene"}
     experiment = replace_at(Experiment(scene(scenes, lane["scene"]), config), values)
     info, truth = simulate_and_filter(experiment, key)
-    return run_metrics(info, truth) | {"loss": objective(experiment.scenario, info, truth)}
+    scenario = experiment.scenario
+    costs = {"loss": objective(scenario, info, truth), "camera_motion_m2_s2": camera_motion_m2_s2(scenario)}
+    return run_metrics(info, truth) | costs
 
 
 def _origin(scenarios, config, columns, objective: Objective, num_seeds: int, key) -> dict[str, Any]:

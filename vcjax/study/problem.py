@@ -1,5 +1,6 @@
 """What is tuned: an objective of runs in some scenes, as a function of free numbers."""
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 
 import equinox as eqx
@@ -16,13 +17,15 @@ from vcjax.study.sweep import Experiment, require_paths
 
 MAX_AMPLITUDE_M = 0.5
 """How far a camera on a robot can be thought to swing to either side, m."""
+FORWARD_MODE_UP_TO = 4
+"""Numbers up to which forward mode costs no more than reverse mode, whose cost does not depend on them."""
 
 
 class Problem(eqx.Module):
     """What is minimised: an objective of runs in some scenes, by numbers of scenario and configuration.
 
     The numbers are the same in all scenes. `config` decides smoothly: `smoothing` is "soft" (a true gradient) or
-    "straight_through" (the hard filter's numbers).
+    "straight_through" (the hard filter's numbers); its `reverse_mode` says how the derivative is taken.
     """
 
     scenes: Scenario
@@ -66,7 +69,8 @@ def problem_of(
 
     Args:
         scenarios: scenes by name, which differ in numbers only.
-        config: the filter.
+        config: the filter. Its derivative is taken in forward mode for up to `FORWARD_MODE_UP_TO` parameters, in
+            reverse mode for more, whatever its `reverse_mode` says.
         parameters: path of a numeric leaf, as in a sweep → where it may go.
         objective: what to make small; soft F1 of the tracks if None.
 
@@ -76,10 +80,9 @@ def problem_of(
     """
     scenes = stacked(scenarios)
     require_kind("tune", "config", config, FilterConfig, "give a FilterConfig with smoothing='soft'.")
-    if config.smoothing == "hard" or config.reverse_mode:
+    if config.smoothing == "hard":
         raise ValueError(
-            f"tune(config.smoothing={config.smoothing!r}, config.reverse_mode={config.reverse_mode}): give "
-            "smoothing 'soft' or 'straight_through', which have a derivative, and reverse_mode=False."
+            "tune(config.smoothing='hard'): give smoothing 'soft' or 'straight_through', which have a derivative."
         )
     if not isinstance(parameters, Mapping) or not parameters:
         raise ValueError(f"tune(parameters={parameters!r}): give at least one path with its interval.")
@@ -96,4 +99,5 @@ def problem_of(
                 f"tune(parameters[{path!r}]) from {interval.low:g} to {interval.high:g}: A is a swing of the camera, "
                 f"between 0 and {MAX_AMPLITUDE_M} m."
             )
+    config = dataclasses.replace(config, reverse_mode=len(parameters) > FORWARD_MODE_UP_TO)
     return Problem(scenes, config, objective or Objective(), tuple(parameters), tuple(parameters.values()))

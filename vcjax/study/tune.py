@@ -102,7 +102,8 @@ def tune(
             if kept is not None:
                 kept.write(history)
             if progress is not None:
-                progress(f"descent {number + 1} of {num_starts}", len(history), schedule.num_steps)
+                loss = f"descent {number + 1} of {num_starts}, loss {history[-1].loss:.3f}"
+                progress(loss, len(history), schedule.num_steps)
 
         descents.append(
             descend(
