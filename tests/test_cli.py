@@ -189,7 +189,7 @@ def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path)
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        ([], ["reproduce", "report", "simulate", "track", "inspect", "run", "evaluate"]),
+        ([], ["reproduce", "report", "simulate", "track", "record", "inspect", "run", "evaluate"]),
         (["reproduce"], ["--seeds", "--tables", "2 3 4 5", "--out", "--key", "--devices", "the paper: 25"]),
         (["report"], ["PATH", "Directory of an earlier"]),
         (["simulate", "--gate", "RE"], ["--gate {RE,VC}", "--th1", "--min-searches"]),

@@ -9,14 +9,15 @@ import jaxtyping
 import numpy as np
 import pytest
 import recorded
-from rendered import rendered
+from rendered import rendered, tracked
 from told import assert_one_line, said
 
 import vcjax as vc
 from vcjax.cli import main
 from vcjax.sources.recording_file import load_recording, save_recording
 from vcjax.sources.table_file import write_table
-from vcjax.sources.tracks import read_tracks
+from vcjax.sources.table_recording import write_labels
+from vcjax.sources.tracks import read_tracks, write_tracks
 from vcjax.sources.trajectory_file import read_tum, write_kitti, write_tum
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
@@ -91,6 +92,23 @@ def test_start_at_the_truth(folder, tmp_path, capsys):
     said(capsys)
     assert main(command) == 1
     assert_one_line(said(capsys)[1], "has no true pose of the first image")
+
+
+def test_tables_become_a_recording(folder, tmp_path, capsys):
+    tracks = write_tracks(tmp_path / "tracks.csv", tracked())
+    known = ["--calibration", str(folder / "calibration.json"), "--out", str(tmp_path / "a.npz")]
+    assert main(["record", str(tracks), *known]) == 1
+    assert_one_line(said(capsys)[1], "give --times or --rate-hz, one of the two")
+    known += ["--times", str(folder / "times.csv"), "--odometry", str(folder / "odometry.csv"), "--truth-of", "camera"]
+    labels = write_labels(tmp_path / "labels.csv", recorded.content().labels)
+    assert (
+        main(["record", str(tracks), *known, "--truth", str(folder / "groundtruth.txt"), "--labels", str(labels)]) == 0
+    )
+    assert "poses of 30 frames" in said(capsys)[0]
+    found = load_recording(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found.recording.uv_px, recorded.content().recording.uv_px)
+    np.testing.assert_allclose(found.truth.robot, recorded.content().truth.robot, atol=1e-9)
+    np.testing.assert_array_equal(found.labels.label, recorded.content().labels.label)
 
 
 def test_inspect_prints_and_draws(tmp_path, capsys):

@@ -16,6 +16,7 @@ from vcjax.commands.console import say
 from vcjax.commands.evaluate import Evaluate
 from vcjax.commands.inspect import Inspect
 from vcjax.commands.paper import Report, Reproduce
+from vcjax.commands.record import Record
 from vcjax.commands.run import Run
 from vcjax.commands.simulate import Simulate
 from vcjax.commands.sweep import Sweep
@@ -24,7 +25,7 @@ from vcjax.commands.tune import Tune
 from vcjax.filter.config import FilterConfig
 from vcjax.study.reproduce import GATES
 
-WITHOUT_DEVICES = (Report, Track, Inspect, Evaluate)
+WITHOUT_DEVICES = (Report, Track, Record, Inspect, Evaluate)
 """Commands that compute nothing in JAX."""
 
 
@@ -70,6 +71,7 @@ def _parse(arguments: list[str]) -> Any:
         | Annotated[Tune, tyro.conf.subcommand("tune")]
         | Annotated[Sweep, tyro.conf.subcommand("sweep")]
         | Annotated[Track, tyro.conf.subcommand("track")]
+        | Annotated[Record, tyro.conf.subcommand("record")]
         | Annotated[Inspect, tyro.conf.subcommand("inspect")]
         | Annotated[Run, tyro.conf.subcommand("run", default=run)]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]

@@ -105,7 +105,7 @@ class ImageSequence:
         poses = interpolated(self.truth, self.time_s, max_gap_s)
         if self.truth.of == "robot":
             return poses
-        return _robot_of_camera(poses, self.mounts())
+        return robot_of_camera(poses, self.mounts())
 
     def mounts(self) -> Float[np.ndarray, "T 7"]:
         """Pose T_r_s of the camera in the robot at each image, with its commanded displacement."""
@@ -219,8 +219,8 @@ def interpolated(
     return found
 
 
-def _robot_of_camera(T_w_c: Float[np.ndarray, "T 7"], T_r_s: Float[np.ndarray, "T 7"]) -> Float[np.ndarray, "T 7"]:
-    """T_w_r = T_w_c T_r_s⁻¹; NaN stays NaN."""
+def robot_of_camera(T_w_c: Float[np.ndarray, "T 7"], T_r_s: Float[np.ndarray, "T 7"]) -> Float[np.ndarray, "T 7"]:
+    """Poses of the robot from those of its camera, T_w_r = T_w_c T_r_s⁻¹; NaN stays NaN."""
     from scipy.spatial.transform import Rotation
 
     is_known = np.isfinite(T_w_c[:, 0])
