@@ -41,19 +41,20 @@ import vcjax as vc
 from vcjax.report.feature_pictures import FeaturePictures
 from vcjax.report.path_view import path_figure
 from vcjax.simulation.world import Movers
+from vcjax.sources.front_end import FrontEnd
 from vcjax.sources.image_folder import read_sequence
 from vcjax.sources.image_sequence import record
-from vcjax.sources.map_file import LandmarkMap
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.overview import summary
 from vcjax.sources.recording_file import TrackLabel, load_recording, save_recording
 from vcjax.sources.rendered_sequence import render_sequence
 from vcjax.sources.tracks import tracks_of
 from vcjax.study.filtered import filter_recording
+from vcjax.study.run_folder import landmark_map, robot_poses
 from vcjax.study.run_summary import run_summary, run_summary_text
 from vcjax.study.track_detection import track_detection, track_detection_text
 from vcjax.study.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
-from vcjax.study.verdicts import VERDICTS, classes, track_verdicts, verdicts
+from vcjax.study.verdicts import VERDICTS, track_verdicts, verdicts
 
 # %% [markdown]
 # ## 1. Images
@@ -94,8 +95,6 @@ for axes, t in zip(panels, (0, 39), strict=True):
 # `vcjax track sequence --max-features 150 --out recording.npz`, then `vcjax inspect recording.npz`.
 
 # %%
-from vcjax.sources.front_end import FrontEnd
-
 content = record(sequence, FrontEnd(max_features=150))
 # Only because these images are rendered is it known what each track follows.
 content = content._replace(labels=world.followed(tracks_of(content.recording)).labels)
@@ -145,8 +144,8 @@ display(Image(filename=pictures.write_animation(range(0, 40, 2), folder / "featu
 
 # %%
 truth = np.asarray(content.truth.robot)
-landmarks = LandmarkMap(*filtered.landmarks, classes(filtered.landmarks.track_id, tracks))
-figure = path_figure(filtered.info.vehicle[:, :7], landmarks, dead_reckoning(content.recording), truth)
+path = robot_poses(filtered.info)
+figure = path_figure(path, landmark_map(filtered, tracks), dead_reckoning(content.recording), truth)
 figure.savefig(folder / "path.png", dpi=110)
 display(Image(filename=folder / "path.png"))
 
@@ -168,7 +167,7 @@ assert counts["dynamic"] > 0 and counts["accepted"] > 300
 
 # %%
 time_s = np.asarray(content.recording.time_s)
-error = trajectory_error(Trajectory(filtered.info.vehicle[:, :7], time_s), Trajectory(truth, time_s))
+error = trajectory_error(Trajectory(path, time_s), Trajectory(truth, time_s))
 alone = trajectory_error(Trajectory(dead_reckoning(content.recording), time_s), Trajectory(truth, time_s))
 print(trajectory_error_text(error))
 print("\nodometry alone\n" + trajectory_error_text(alone))

@@ -190,7 +190,7 @@ def test_frame_without_odometry_is_named(tmp_path):
 
 
 def test_dead_reckoning_by_hand():
-    """One step along x, a quarter turn to the left on the spot, one step along what is now y; from a start of its own."""
+    """A step along x, a quarter turn to the left on the spot, a step along what is now y; from a start of its own."""
     recording = good_recording()
     odometry = np.zeros((5, 6))
     odometry[0, 0], odometry[1, 5], odometry[2, 0] = 1.0, np.pi / 2, 2.0
