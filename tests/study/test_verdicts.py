@@ -1,5 +1,6 @@
 """Verdicts worked out by hand, of each frame and of each track, and the summary of a run."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -18,32 +19,22 @@ from vcjax.study.verdicts import VERDICTS, classes, track_verdicts, verdicts
 nan = math.nan
 
 
-def frame_info(ids, verdict, re1, re2, margin, deleted=(), is_finite=True, is_full=False) -> FrameInfo:
-    """A frame with candidates of given verdicts, "" where not measured."""
-    K, word = len(ids), np.array(verdict)
-    return FrameInfo(
-        vehicle=np.array([0, 0, 0, 1, 0, 0, 0] * 2, float),
-        vehicle_cov=np.zeros((14, 14)),
-        candidate_id=np.array(ids, np.int32),
-        is_measured=word != "",
-        pixel=np.zeros((K, 2)),
-        innovation=np.zeros((K, 2)),
-        innovation_cov=np.zeros((K, 2, 2)),
-        re1=np.array(re1, float),
-        re1_prior=np.array(re1, float),
-        re2=np.array(re2, float),
-        is_accepted=word == "accepted",
-        is_recovered=word == "recovered",
-        is_dynamic=word == "dynamic",
-        dynamic_margin=np.array(margin, float),
-        p_dynamic=(word == "dynamic").astype(float),
-        inconsistent_id=np.array([*deleted, *[-1] * (2 - len(deleted))], np.int32),
-        born_id=np.array([-1], np.int32),
-        track_id=np.array([7, -1], np.int32),
-        num_coordinates=np.array(21),
-        map_is_full=np.array(is_full),
-        is_finite=np.array(is_finite),
-    )
+def frame_info(ids, verdict, re1, re2, margin, deleted=(), is_finite=True, is_full=False) -> dict:
+    """What the info of a frame with candidates of given verdicts holds; "" where not measured."""
+    word = np.array(verdict)
+    return {
+        "candidate_id": np.array(ids, np.int32),
+        "is_measured": word != "",
+        "re1": np.array(re1, float),
+        "re2": np.array(re2, float),
+        "is_accepted": word == "accepted",
+        "is_recovered": word == "recovered",
+        "is_dynamic": word == "dynamic",
+        "dynamic_margin": np.array(margin, float),
+        "inconsistent_id": np.array([*deleted, *[-1] * (2 - len(deleted))], np.int32),
+        "map_is_full": np.array(is_full),
+        "is_finite": np.array(is_finite),
+    }
 
 
 @pytest.fixture
@@ -53,7 +44,8 @@ def info(unchecked) -> FrameInfo:
         frame_info([-1, 9, 7], ["", "dynamic", "accepted"], [nan, 30.0, 2.0], [nan, 4.0, nan], [nan, 17.0, -7.0], [4]),
         frame_info([7, 3, -1], ["rejected", "accepted", ""], [10, 3, 1], [nan] * 3, [1, -6, nan], [8], True, True),
     ]  # fmt: skip
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *frames)
+    # The rest is that of some other run.
+    return dataclasses.replace(recorded.run().info, **jax.tree.map(lambda *leaves: np.stack(leaves), *frames))
 
 
 def test_rows_by_frame(info):

@@ -12,7 +12,7 @@ from vcjax.sources.map_file import CLASS_COLOURS, LandmarkMap
 _PATH, _TRUTH, _ODOMETRY = "#0072b2", "#000000", "#999999"
 _MARGIN = 0.15
 """How much room the view leaves around what it shows, as a part of its extent."""
-_MOST_ROOM = 2.0
+_MOST_ROOM = 4.0
 """How far beyond the paths it reaches for landmarks, as a multiple of their extent."""
 _WELL_KNOWN = 0.2
 """Largest standard deviation of a landmark that the view reaches for, as a part of its distance from the middle."""

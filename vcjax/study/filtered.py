@@ -4,6 +4,7 @@ The state is stepped from frame to frame on the host, so that memory holds one s
 the landmarks that leave the map, retired or deleted, stay known by their last mean and covariance.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import NamedTuple
@@ -97,7 +98,7 @@ def filter_recording(
 
 def _frame(recording: Recording, t: int) -> Frame:
     """Frame t, cut out on the host where the recording is there."""
-    names = ("odometry", "odometry_cov", "sensor_shift_m", "track_id", "uv_px", "is_valid", "is_last")
+    names = [field.name for field in dataclasses.fields(Frame) if field.name != "camera"]
     return Frame(camera=recording.camera, **{name: jnp.asarray(getattr(recording, name)[t]) for name in names})
 
 
