@@ -82,11 +82,16 @@ class Run:
             say(console, f"{missing}: no such image; features are drawn on plain axes.")
             drawn.on_plain_axes()
         num_frames = content.recording.num_frames
-        for t in _spread(num_frames, self.pictures):
-            drawn.write_picture(t, new / "features" / f"{t:06d}.png")
+        alone, moving = _spread(num_frames, self.pictures), range(0)
         if self.animation != "none":
-            frames = range(0, num_frames, -(-num_frames // self.animation_frames))
-            drawn.write_animation(frames, new / f"features.{self.animation}", show)
+            moving = range(0, num_frames, -(-num_frames // self.animation_frames))
+        num = len(alone) + len(moving)
+        for done, t in enumerate(alone, 1):
+            drawn.write_picture(t, new / "features" / f"{t:06d}.png")
+            show(done, num)
+        if moving:
+            path = new / f"features.{self.animation}"
+            drawn.write_animation(moving, path, lambda done, _: show(len(alone) + done, num))
 
 
 def _draw_path(content: RecordingFile, filtered: Filtered, landmarks: LandmarkMap, new: Path) -> None:

@@ -101,7 +101,8 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     image.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="u (px)", ylabel="v (px)")
     image.set_title("Where tracks begin")
     if np.any(is_moving):
-        image.legend(loc="lower right", fontsize=8)
+        # Below: wherever it is put inside, it hides tracks.
+        image.legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), borderaxespad=4.5, ncols=2, fontsize=8, frameon=False)
 
     path.plot(*dead_reckoning(recording)[:, :2].T, color=_GREY, label="odometry alone")
     if truth is not None:
