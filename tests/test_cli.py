@@ -34,8 +34,8 @@ def test_gate_is_the_last_one_named(options, gate, th1, tmp_path, monkeypatch, c
         seen.append(config)
         return fake_runs(num_seeds=2)
 
-    monkeypatch.setattr("vcjax.commands.run.monte_carlo", monte_carlo)
-    assert main(["run", *options]) == 0
+    monkeypatch.setattr("vcjax.commands.simulate.monte_carlo", monte_carlo)
+    assert main(["simulate", *options]) == 0
     assert type(seen[0].gate).__name__ == gate and seen[0].gate.th1 == th1
     assert len(list(tmp_path.rglob("*"))) >= 1
 
@@ -57,11 +57,12 @@ def test_detector_is_the_one_named_with_options_of_its_own(name, tmp_path, monke
 def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
     seen = []
     monkeypatch.setattr(
-        "vcjax.commands.run.monte_carlo", lambda *given, **more: seen.append((*given, more)) or fake_runs(num_seeds=2)
+        "vcjax.commands.simulate.monte_carlo",
+        lambda *given, **more: seen.append((*given, more)) or fake_runs(num_seeds=2),
     )
     options = "--robot curved --dynamic-set 3 4 5 --noise six_axis --pixel-error-std-px 0.5 --pixel-std-px 2 "
     options += "--min-searches 7 --no-retire --update stacked --prior predicted --th2 0"
-    assert main(["run", *options.split(), "--out", str(tmp_path / "runs.nc")]) == 0
+    assert main(["simulate", *options.split(), "--out", str(tmp_path / "runs.nc")]) == 0
     scenario, config, more = seen[0]
     assert scenario.increment[2] == 0.5 and scenario.odometry_std[2] == 0.005
     assert np.asarray(scenario.movers.ids).tolist() == [3, 4, 5]
@@ -73,13 +74,13 @@ def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
 def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsys):
     seen = []
     monkeypatch.setattr(
-        "vcjax.commands.run.monte_carlo", lambda *given, **_: seen.append(given) or fake_runs(num_seeds=2)
+        "vcjax.commands.simulate.monte_carlo", lambda *given, **_: seen.append(given) or fake_runs(num_seeds=2)
     )
     options = "--start 1 2 30 --increment 0.1 0 -1 --odometry-std 1 2 3 4 5 6 --mount 0 0 1 -80 0 -90 "
     options += "--intrinsics-px 300 200 250 251 --image-size-px 600 400 --distortion 0.1 -0.02 "
     options += "--grid-low-m -4 --grid-high-m 4 --grid-per-side 5 --grid-heights-m 0.5 --dynamic-direction 1 0 1 "
     options += "--dynamic-speed-m-s 0.5 --dynamic-places-m 0 0 0.5 2 -2 0.5"
-    assert main(["run", *options.split(), "--out", str(tmp_path / "runs.nc")]) == 0
+    assert main(["simulate", *options.split(), "--out", str(tmp_path / "runs.nc")]) == 0
     expected = vc.scenarios.paper(
         dynamic_speed_m_s=0.5,
         dynamic_set=[12, 16],
@@ -98,14 +99,14 @@ def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsy
     )
     assert describe(seen[0][0]) == describe(expected)
     options = ["--dynamic", "lateral", "--dynamic-drawn", "4", "--dynamic-seed", "7"]
-    assert main(["run", *options, "--out", str(tmp_path / "b.nc")]) == 0
+    assert main(["simulate", *options, "--out", str(tmp_path / "b.nc")]) == 0
     assert describe(seen[1][0]) == describe(vc.scenarios.paper(dynamic="lateral", dynamic_drawn=4, dynamic_seed=7))
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("", ["reproduce, report, run"]),
+        ("", ["reproduce, report, simulate"]),
         ("reprot", ["reprot"]),
         ("report", ["PATH"]),
         ("report nowhere", ["nowhere: no results", "run `vcjax reproduce` first"]),
@@ -116,49 +117,58 @@ def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsy
         ("reproduce --out file", ["file"]),
         ("reproduce --out file/below", ["file"]),
         ("reproduce --seeds many", ["--seeds", "'many'"]),
-        ("run --out file/below.nc", ["file is a file; give a place in a directory"]),
-        ("run --out folder", ["folder is a directory; give the name of a file"]),
-        ("run --seeds 0", ["num_seeds=0", "give at least one seed"]),
-        ("run --devices 0", ["--devices 0: give at least one device"]),
-        ("run --devices -1", ["--devices -1"]),
+        ("simulate --out file/below.nc", ["file is a file; give a place in a directory"]),
+        ("simulate --out folder", ["folder is a directory; give the name of a file"]),
+        ("simulate --seeds 0", ["num_seeds=0", "give at least one seed"]),
+        ("simulate --devices 0", ["--devices 0: give at least one device"]),
+        ("simulate --devices -1", ["--devices -1"]),
         (
-            "run --distributed",
+            "simulate --distributed",
             ["processes cannot be joined", "give each --coordinator HOST:PORT, --num-processes and --process-id"],
         ),
-        ("run --process-id 0", ["belong together: give all three"]),
-        ("run --coordinator here:1 --num-processes 2 --process-id 2", ["--process-id 2 of --num-processes 2"]),
-        ("run --coordinator here --num-processes 1 --process-id 0", ["--coordinator here: give HOST:PORT"]),
-        ("run --coordinator 1234 --num-processes 1 --process-id 0", ["--coordinator 1234: give HOST:PORT"]),
-        ("run --coordinator here:99999 --num-processes 1 --process-id 0", ["--coordinator here:99999: give HOST:PORT"]),
-        ("run --key 99999999999999999999", ["--key 99999999999999999999", "64 bits"]),
-        ("run --nonsense 3", ["--nonsense"]),
-        ("run --gate XX", ["'XX'", "--gate", "'RE', 'VC'"]),
-        ("run --gate RE --th2 3", ["--th2", "--th1"]),
-        ("run --th1 -1", ["VirtualCorrection(th1=-1.0)", "is positive"]),
-        ("run --gate RE --th1 0", ["ReprojectionError(th1=0.0)", "is positive"]),
-        ("run --detector XX", ["'XX'", "--detector", "velocity_glr"]),
-        ("run --detector velocity_glr --false-alarm-rate 2", ["VelocityGLR(false_alarm_rate=2.0)", "(0, 1)"]),
-        ("run --detector velocity_glr --forgetting 0.9", ["VelocityGLR(forgetting=0.9)", "give a threshold"]),
-        ("run --blacklist-frames -1", ["FilterConfig(blacklist_frames=-1.0)", "infinity: for good"]),
-        ("run --th2 nan", ["VirtualCorrection(th2=nan)"]),
-        ("run --oscillation-frequency-hz 5", ["frequency_hz=5.0", "half the frame rate of 10.0 Hz", "lower frequency"]),
-        ("run --oscillation-amplitude-m -0.1", ["amplitude_m=-0.1"]),
-        ("run --num-frames 0", ["num_frames=0", "at least 1"]),
-        ("run --max-updates 0", ["max_updates=0", "at least 1"]),
-        ("run --max-landmarks 8", ["max_updates=10", "max_landmarks=8", "raise max_landmarks"]),
-        ("run --pixel-std-px -1", ["FilterConfig(pixel_std_px=-1.0)", "positive"]),
-        ("run --pixel-error-std-px -1", ["pixel_std_px=-1.0", "at least 0"]),
-        ("run --dynamic-set 1 162", ["162", "there are 162 features, numbered from 0"]),
-        ("run --dynamic-set 5 5", ["Movers(ids=[5, 5])", "feature 5 comes twice"]),
-        ("run --dynamic-places-m 4 0 0 4 3 0", ["places_m[1]=[4.0, 3.0, 0.0]", "no feature is there", "nearest, 59"]),
-        ("run --dynamic-drawn 200", ["num_drawn=200", "from 0 to 162"]),
-        ("run --dynamic lateral --dynamic-direction 1 0 0", ["dynamic='lateral'", "give one of the two"]),
-        ("run --start 1 2", ["--start"]),
-        ("run --intrinsics-px 320 240 0 320", ["Camera(intrinsics_px=", "must be positive"]),
-        ("run --odometry-std 0 0 0 0 0 -1", ["Scenario(odometry_std=", "at least 0"]),
-        ("run --grid-per-side 0", ["grid(num_per_side=0)", "at least 1"]),
-        ("run --dynamic-speed-m-s -1 --dynamic lateral", ["speed_m_s=-1.0", "at least 0"]),
-        ("run --robot sideways", ["'sideways'", "--robot", "lateral"]),
+        ("simulate --process-id 0", ["belong together: give all three"]),
+        ("simulate --coordinator here:1 --num-processes 2 --process-id 2", ["--process-id 2 of --num-processes 2"]),
+        ("simulate --coordinator here --num-processes 1 --process-id 0", ["--coordinator here: give HOST:PORT"]),
+        ("simulate --coordinator 1234 --num-processes 1 --process-id 0", ["--coordinator 1234: give HOST:PORT"]),
+        (
+            "simulate --coordinator here:99999 --num-processes 1 --process-id 0",
+            ["--coordinator here:99999: give HOST:PORT"],
+        ),
+        ("simulate --key 99999999999999999999", ["--key 99999999999999999999", "64 bits"]),
+        ("simulate --nonsense 3", ["--nonsense"]),
+        ("simulate --gate XX", ["'XX'", "--gate", "'RE', 'VC'"]),
+        ("simulate --gate RE --th2 3", ["--th2", "--th1"]),
+        ("simulate --th1 -1", ["VirtualCorrection(th1=-1.0)", "is positive"]),
+        ("simulate --gate RE --th1 0", ["ReprojectionError(th1=0.0)", "is positive"]),
+        ("simulate --th2 nan", ["VirtualCorrection(th2=nan)"]),
+        (
+            "simulate --oscillation-frequency-hz 5",
+            ["frequency_hz=5.0", "half the frame rate of 10.0 Hz", "lower frequency"],
+        ),
+        ("simulate --oscillation-amplitude-m -0.1", ["amplitude_m=-0.1"]),
+        ("simulate --num-frames 0", ["num_frames=0", "at least 1"]),
+        ("simulate --max-updates 0", ["max_updates=0", "at least 1"]),
+        ("simulate --max-landmarks 8", ["max_updates=10", "max_landmarks=8", "raise max_landmarks"]),
+        ("simulate --pixel-std-px -1", ["FilterConfig(pixel_std_px=-1.0)", "positive"]),
+        ("simulate --pixel-error-std-px -1", ["pixel_std_px=-1.0", "at least 0"]),
+        ("simulate --dynamic-set 1 162", ["162", "there are 162 features, numbered from 0"]),
+        ("simulate --dynamic-set 5 5", ["Movers(ids=[5, 5])", "feature 5 comes twice"]),
+        (
+            "simulate --dynamic-places-m 4 0 0 4 3 0",
+            ["places_m[1]=[4.0, 3.0, 0.0]", "no feature is there", "nearest, 59"],
+        ),
+        ("simulate --dynamic-drawn 200", ["num_drawn=200", "from 0 to 162"]),
+        ("simulate --dynamic lateral --dynamic-direction 1 0 0", ["dynamic='lateral'", "give one of the two"]),
+        ("simulate --start 1 2", ["--start"]),
+        ("simulate --intrinsics-px 320 240 0 320", ["Camera(intrinsics_px=", "must be positive"]),
+        ("simulate --odometry-std 0 0 0 0 0 -1", ["Scenario(odometry_std=", "at least 0"]),
+        ("simulate --grid-per-side 0", ["grid(num_per_side=0)", "at least 1"]),
+        ("simulate --dynamic-speed-m-s -1 --dynamic lateral", ["speed_m_s=-1.0", "at least 0"]),
+        ("simulate --robot sideways", ["'sideways'", "--robot", "lateral"]),
+        ("simulate --detector XX", ["'XX'", "--detector", "velocity_glr"]),
+        ("simulate --detector velocity_glr --false-alarm-rate 2", ["VelocityGLR(false_alarm_rate=2.0)", "(0, 1)"]),
+        ("simulate --detector velocity_glr --forgetting 0.9", ["VelocityGLR(forgetting=0.9)", "give a threshold"]),
+        ("simulate --blacklist-frames -1", ["FilterConfig(blacklist_frames=-1.0)", "infinity: for good"]),
     ],
 )
 def test_what_is_refused_is_said_clearly(arguments, words, tmp_path, monkeypatch, capsys):
@@ -198,12 +208,12 @@ def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path)
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        ([], ["reproduce", "report", "run"]),
+        ([], ["reproduce", "report", "simulate", "track", "record", "inspect", "run", "evaluate"]),
         (["reproduce"], ["--seeds", "--tables", "2 3 4 5", "--out", "--key", "--devices", "the paper: 25"]),
         (["report"], ["PATH", "Directory of an earlier"]),
-        (["run", "--gate", "RE"], ["--gate {RE,VC}", "--th1", "--min-searches"]),
+        (["simulate", "--gate", "RE"], ["--gate {RE,VC}", "--th1", "--min-searches"]),
         (
-            ["run"],
+            ["simulate"],
             [
                 "--gate {RE,VC}", "--seeds", "--out", "--th1", "--th2", "--prior", "--robot", "--dynamic", "speed, m/s",
                 "--oscillation-amplitude-m", "--oscillation-frequency-hz", "Hz, below half the frame rate", "--noise",
@@ -223,13 +233,24 @@ def test_help_shows_every_option_with_its_unit(command, words, capsys, monkeypat
     assert not stop.value.code and told == ""
     for word in words:
         assert word in printed
-    if command[:1] == ["run"]:
+    if command[:1] == ["simulate"]:
         assert ("--th2" in printed) == ("RE" not in command)
 
 
 def test_installed_command_starts_with_one_line_for_bad_input(tmp_path):
     """In a process of its own, as people have it: exit status, no traceback, standard output left alone."""
-    command = [sys.executable, "-m", "vcjax", "run", "--devices", "2", "--seeds", "0", "--out", str(tmp_path / "a.nc")]
+    command = [
+        sys.executable,
+        "-m",
+        "vcjax",
+        "simulate",
+        "--devices",
+        "2",
+        "--seeds",
+        "0",
+        "--out",
+        str(tmp_path / "a.nc"),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stdout == ""
     assert_one_line(done.stderr, "num_seeds=0")

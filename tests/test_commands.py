@@ -25,10 +25,10 @@ SMALL = ["--num-frames", "12", "--seeds", "3", "--max-landmarks", "24", "--max-u
 
 
 @pytest.mark.parametrize("gate", ["RE", "VC"])
-def test_run_prints_a_summary_and_saves_the_runs(gate, tmp_path, capsys):
+def test_simulate_prints_a_summary_and_saves_the_runs(gate, tmp_path, capsys):
     out = tmp_path / "[bold]folder" / "runs.nc"
     options = ["--gate", gate, "--th1", "4", "--dynamic", "lateral", "--key", "5", "--out", str(out)]
-    assert main(["run", *SMALL, *options, "--oscillation-amplitude-m", "0.05"]) == 0
+    assert main(["simulate", *SMALL, *options, "--oscillation-amplitude-m", "0.05"]) == 0
     printed, told = said(capsys)
     runs = load(out)
     assert printed == f"{vc.summarise(runs)}\n" and printed.strip() == summary_text(vc.summarise(runs)).strip()
@@ -87,9 +87,9 @@ def test_damaged_results_get_one_clear_line(tmp_path, capsys):
 
 
 def test_only_the_first_process_saves_the_runs(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("vcjax.commands.run.monte_carlo", lambda *_, **__: fake_runs(num_seeds=2))
+    monkeypatch.setattr("vcjax.commands.simulate.monte_carlo", lambda *_, **__: fake_runs(num_seeds=2))
     monkeypatch.setattr(jax, "process_index", lambda: 1)
-    assert main(["run", "--out", str(tmp_path / "runs.nc")]) == 0
+    assert main(["simulate", "--out", str(tmp_path / "runs.nc")]) == 0
     assert said(capsys)[0] == "" and not list(tmp_path.iterdir())
 
 

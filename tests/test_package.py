@@ -39,6 +39,7 @@ ROOMS = {
             "gates",
             "filter",
             "simulation",
+            "sources",
             "devices",
         }
     ),

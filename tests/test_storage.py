@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from vcjax.storage import LEFTOVER_AGE_S, check_writable, replacing, write_file
+from vcjax.storage import LEFTOVER_AGE_S, check_writable, filling, replacing, write_file
 
 
 def names(folder) -> list[str]:
@@ -121,3 +121,67 @@ def test_unwritable_folder_is_refused(tmp_path):
     for refuse in (check_writable, lambda place: write_file(place, b"")):
         with pytest.raises(PermissionError, match="locked"):
             refuse(folder / "note.txt")
+
+
+def test_folder_is_filled_at_once_and_the_last_file_comes_last(tmp_path):
+    folder = tmp_path / "new" / "folder"
+    with filling(folder, "done.txt", ["*.old"]) as temporary:
+        write_file(temporary / "done.txt", b"1")
+        write_file(temporary / "a" / "b.txt", b"1")
+        assert names(folder) == [temporary.name]
+    assert names(folder) == ["a", "done.txt"] and names(folder / "a") == ["b.txt"]
+    write_file(folder / "one.old", b"")
+    write_file(folder / "mine.txt", b"mine")
+    with filling(folder, "done.txt", ["*.old"]) as temporary:
+        write_file(temporary / "done.txt", b"2")
+        assert (folder / "done.txt").read_bytes() == b"1" and (folder / "one.old").exists()
+    assert names(folder) == ["a", "done.txt", "mine.txt"] and (folder / "done.txt").read_bytes() == b"2"
+
+
+def test_unfinished_folder_has_no_last_file(tmp_path, monkeypatch):
+    """Killed while files move: what says that they are complete is gone first."""
+    write_file(tmp_path / "done.txt", b"1")
+    moved = []
+
+    def replace(source, target):
+        moved.append(target.name)
+        if len(moved) == 2:
+            raise KeyboardInterrupt
+        os.rename(source, target)
+
+    def fill():
+        with filling(tmp_path, "done.txt", []) as temporary:
+            for name in ("a.txt", "done.txt", "z.txt"):
+                (temporary / name).write_bytes(b"2")
+            monkeypatch.setattr(os, "replace", replace)
+
+    with pytest.raises(KeyboardInterrupt):
+        fill()
+    assert names(tmp_path) == ["a.txt"]
+
+
+@pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
+def test_failure_leaves_the_folder_as_it_was(tmp_path, failure):
+    write_file(tmp_path / "old" / "done.txt", b"1")
+
+    def fill(folder):
+        with filling(folder, "done.txt", ["*.txt"]) as temporary:
+            write_file(temporary / "done.txt", b"2")
+            raise failure
+
+    for folder in (tmp_path / "old", tmp_path / "new"):
+        with pytest.raises(failure):
+            fill(folder)
+    assert names(tmp_path) == ["old"] and (tmp_path / "old" / "done.txt").read_bytes() == b"1"
+
+
+def test_leftovers_of_killed_fillings_go_when_they_are_old(tmp_path):
+    for name in ("old", "new"):
+        write_file(tmp_path / f".filling.{name}.tmp" / "a.txt", b"")
+    age(tmp_path / ".filling.old.tmp")
+    with filling(tmp_path, "done.txt", []):
+        pass
+    assert names(tmp_path) == [".filling.new.tmp"]
+    write_file(tmp_path / "file", b"")
+    with pytest.raises(OSError, match="is a file"), filling(tmp_path / "file", "done.txt", []):
+        pass

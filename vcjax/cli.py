@@ -5,7 +5,7 @@ import io
 import sys
 import traceback
 from collections.abc import Collection, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import tyro
@@ -14,12 +14,20 @@ from rich.console import Console
 from vcjax.commands.bench import Bench
 from vcjax.commands.console import say
 from vcjax.commands.detectability import Detectability
+from vcjax.commands.evaluate import Evaluate
+from vcjax.commands.inspect import Inspect
 from vcjax.commands.paper import Report, Reproduce
+from vcjax.commands.record import Record
 from vcjax.commands.run import Run
+from vcjax.commands.simulate import Simulate
 from vcjax.commands.sweep import Sweep
+from vcjax.commands.track import Track
 from vcjax.commands.tune import Tune
 from vcjax.filter.config import FilterConfig
 from vcjax.study.reproduce import DETECTORS, GATES
+
+WITHOUT_DEVICES = (Report, Track, Record, Inspect, Evaluate)
+"""Commands that compute nothing in JAX."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:
         command = _parse(arguments)
-        if not isinstance(command, Report):
+        if not isinstance(command, WITHOUT_DEVICES):
             command.devices.start()
         command(console)
     except (ValueError, OSError, ModuleNotFoundError) as error:
@@ -52,19 +60,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _parse(arguments: list[str]) -> Reproduce | Report | Run | Tune | Sweep | Detectability | Bench:
+def _parse(arguments: list[str]) -> Any:
     """The command with its options. Gate and detector have options of their own, so they are looked up first."""
     gate = _named(arguments, "--gate", GATES, "VC")
     detector = _named(arguments, "--detector", DETECTORS, "inlier_ratio")
     config = FilterConfig(gate=GATES[gate](), detector=DETECTORS[detector]())
-    default = Run(scenario=tyro.MISSING, config=config)
+    simulate, run = Simulate(scenario=tyro.MISSING, config=config), Run(recording=tyro.MISSING, config=config)
     union = (
         Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
         | Annotated[Report, tyro.conf.subcommand("report")]
-        | Annotated[Run, tyro.conf.subcommand("run", default=default)]
+        | Annotated[Simulate, tyro.conf.subcommand("simulate", default=simulate)]
         | Annotated[Tune, tyro.conf.subcommand("tune")]
         | Annotated[Sweep, tyro.conf.subcommand("sweep")]
         | Annotated[Detectability, tyro.conf.subcommand("detectability")]
+        | Annotated[Track, tyro.conf.subcommand("track")]
+        | Annotated[Record, tyro.conf.subcommand("record")]
+        | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+        | Annotated[Run, tyro.conf.subcommand("run", default=run)]
+        | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
         | Annotated[Bench, tyro.conf.subcommand("bench")]
     )
     told = io.StringIO()

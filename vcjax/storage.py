@@ -3,9 +3,10 @@
 import contextlib
 import glob
 import os
+import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 LEFTOVER_AGE_S = 600.0
@@ -41,6 +42,45 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
             os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def filling(folder: str | os.PathLike, last: str, stale: Sequence[str]) -> Iterator[Path]:
+    """A temporary folder to write files to, which move into `folder` when the block ends; folders are made as needed.
+
+    If the block fails, nothing in `folder` changes. Other files in it stay as they are.
+
+    Args:
+        folder: where the files go.
+        last: the file that says that the others are complete: an old one goes before the first moves, the new one moves
+            last, so that files of two writers are never taken for one's.
+        stale: patterns of files of earlier writers that are removed where no new ones replace them.
+
+    Raises:
+        OSError: if the place cannot be written.
+    """
+    folder = Path(folder)
+    is_new = not folder.exists()
+    check_writable(folder / last)
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob(".filling.*.tmp"):
+        if time.time() - leftover.stat().st_mtime > LEFTOVER_AGE_S:
+            shutil.rmtree(leftover, ignore_errors=True)
+    temporary = Path(tempfile.mkdtemp(prefix=".filling.", suffix=".tmp", dir=folder))
+    try:
+        yield temporary
+        files = sorted(path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file())
+        (folder / last).unlink(missing_ok=True)
+        for old in {path.relative_to(folder) for pattern in stale for path in folder.glob(pattern)} - {*files}:
+            (folder / old).unlink()
+        for file in sorted(files, key=lambda file: file == Path(last)):
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(temporary / file, folder / file)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if is_new:
+            with contextlib.suppress(OSError):  # it holds what was moved there
+                folder.rmdir()
 
 
 def remove_leftovers(folder: Path, names: str) -> None:

@@ -1,17 +1,21 @@
 """Odometry: against motion along known screws, its covariance against noise drawn, tables there and back."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
+from test_recording import good_recording
 
 from vcjax.models.frames import rotation_matrix
 from vcjax.models.motion import move_by_odometry
 from vcjax.sources.odometry import (
     AXES,
     Odometry,
+    dead_reckoning,
     from_poses,
     from_velocities,
     read_odometry,
@@ -183,3 +187,15 @@ def test_frame_without_odometry_is_named(tmp_path):
     path = write_table(tmp_path / "o.csv", {name: column[:2] for name, column in columns().items()})
     with pytest.raises(ValueError, match=r"o\.csv: no row for frame 5 \(1 such frames\)"):
         read_odometry(path, FRAMES)
+
+
+def test_dead_reckoning_by_hand():
+    """A step along x, a quarter turn to the left on the spot, a step along what is now y; from a start of its own."""
+    recording = good_recording()
+    odometry = np.zeros((5, 6))
+    odometry[0, 0], odometry[1, 5], odometry[2, 0] = 1.0, np.pi / 2, 2.0
+    start = np.array([10.0, 20.0, 30.0, 1.0, 0.0, 0.0, 0.0])
+    poses = dead_reckoning(dataclasses.replace(recording, odometry=odometry, robot_start=start))
+    np.testing.assert_allclose(poses[:, :3], [[11, 20, 30], [11, 20, 30], [11, 22, 30], [11, 22, 30], [11, 22, 30]])
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(poses[[0, 4], 3:], [[1, 0, 0, 0], [half, 0, 0, half]], atol=1e-12)

@@ -47,6 +47,15 @@ def write_figure(figure: Figure, path: Path) -> list[Path]:
     return [write_file(path.with_name(f"{path.name}.{kind}"), _bytes(figure, kind)) for kind in _METADATA]
 
 
+def write_picture(figure: Figure, path: Path) -> Path:
+    """Write a figure as one PNG file under the name given; folders are made as needed.
+
+    Raises:
+        OSError: if the place cannot be written to.
+    """
+    return write_file(path, _bytes(figure, "png"))
+
+
 def _bytes(figure: Figure, kind: str) -> bytes:
     buffer = io.BytesIO()
     with matplotlib.rc_context(RC):

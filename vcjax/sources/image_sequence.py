@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from vcjax import extras
 from vcjax.recording import Truth
 from vcjax.sources.calibration import Calibration
 from vcjax.sources.front_end import FrontEnd, track_images
@@ -104,7 +105,7 @@ class ImageSequence:
         poses = interpolated(self.truth, self.time_s, max_gap_s)
         if self.truth.of == "robot":
             return poses
-        return _robot_of_camera(poses, self.mounts())
+        return robot_of_camera(poses, self.mounts())
 
     def mounts(self) -> Float[np.ndarray, "T 7"]:
         """Pose T_r_s of the camera in the robot at each image, with its commanded displacement."""
@@ -166,8 +167,7 @@ def read_image(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height
         FileNotFoundError: if there is no such file.
         ValueError: naming the file, if it is no image, or of another size.
     """
-    import cv2
-
+    cv2 = extras.load("cv2", "Images", "images")
     found = image_size(path)
     if found != (width, height):
         raise ValueError(
@@ -187,14 +187,13 @@ def image_size(path: Path) -> tuple[int, int]:
         FileNotFoundError: if there is no such file.
         ValueError: naming the file, if it is no image.
     """
-    import PIL.Image
-
+    pillow = extras.load("PIL.Image", "Images", "images")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image.")
     try:
-        with PIL.Image.open(path) as image:
+        with pillow.open(path) as image:
             return image.size
-    except (OSError, SyntaxError, ValueError, PIL.Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError, pillow.DecompressionBombError) as error:
         raise ValueError(f"{path}: no image that can be read ({str(error).splitlines()[0][:100]}).") from error
 
 
@@ -220,8 +219,8 @@ def interpolated(
     return found
 
 
-def _robot_of_camera(T_w_c: Float[np.ndarray, "T 7"], T_r_s: Float[np.ndarray, "T 7"]) -> Float[np.ndarray, "T 7"]:
-    """T_w_r = T_w_c T_r_s⁻¹; NaN stays NaN."""
+def robot_of_camera(T_w_c: Float[np.ndarray, "T 7"], T_r_s: Float[np.ndarray, "T 7"]) -> Float[np.ndarray, "T 7"]:
+    """Poses of the robot from those of its camera, T_w_r = T_w_c T_r_s⁻¹; NaN stays NaN."""
     from scipy.spatial.transform import Rotation
 
     is_known = np.isfinite(T_w_c[:, 0])

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from vcjax.recording import Recording
 from vcjax.sources.table_file import Kind, read_table, write_table
 
 SHIFTS = ("shift_x", "shift_y", "shift_z")
@@ -188,6 +189,20 @@ def unknown_motion(
     """
     zero = np.zeros((len(time_s), 3))
     return from_velocities(time_s, zero, zero, velocity_std_m_s, rate_std_rad_s)
+
+
+def dead_reckoning(recording: Recording) -> Float[np.ndarray, "T 7"]:
+    """Pose T_w_r of the robot in each frame by the recording's odometry alone: what a filter is to be better than."""
+    from scipy.spatial.transform import Rotation
+
+    start = np.array(recording.robot_start, np.float64)
+    place, turn = start[:3], Rotation.from_quat(start[3:], scalar_first=True)
+    poses = []
+    for increment in np.array(recording.odometry, np.float64):
+        place = place + turn.apply(increment[:3])
+        turn = turn * Rotation.from_rotvec(increment[3:])
+        poses.append([*place, *turn.as_quat(scalar_first=True)])
+    return np.array(poses)
 
 
 def _along_screw(turn: Vector, way: Vector) -> Vector:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from vcjax.recording import Recording
+from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, TrackLabel
 from vcjax.sources.tracks import tracks_of
 
@@ -100,9 +101,10 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     image.set(xlim=(0, width), ylim=(height, 0), aspect="equal", xlabel="u (px)", ylabel="v (px)")
     image.set_title("Where tracks begin")
     if np.any(is_moving):
-        image.legend(loc="lower right", fontsize=8)
+        # Below: wherever it is put inside, it hides tracks.
+        image.legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), borderaxespad=4.5, ncols=2, fontsize=8, frameon=False)
 
-    path.plot(*_odometry_path(recording)[:, :2].T, color=_GREY, label="odometry alone")
+    path.plot(*dead_reckoning(recording)[:, :2].T, color=_GREY, label="odometry alone")
     if truth is not None:
         path.plot(*np.asarray(truth.robot)[:, :2].T, color=_BLUE, linestyle="--", label="truth")
     path.set(xlabel="x (m)", ylabel="y (m)", title="Path from above")
@@ -139,17 +141,3 @@ def _shift(recording: Recording) -> str:
     place = np.cumsum(np.asarray(recording.sensor_shift_m), axis=0)
     span = np.ptp(np.vstack([np.zeros(3), place]), axis=0)
     return f"commanded, over {', '.join(map(_num, span))} m" if np.any(span) else "fixed on the robot"
-
-
-def _odometry_path(recording: Recording) -> np.ndarray:
-    """Places of the robot by odometry alone, (T, 3) m."""
-    from scipy.spatial.transform import Rotation
-
-    start = np.array(recording.robot_start, np.float64)
-    place, turn = start[:3], Rotation.from_quat(start[3:], scalar_first=True)
-    places = []
-    for increment in np.array(recording.odometry, np.float64):
-        place = place + turn.apply(increment[:3])
-        turn = turn * Rotation.from_rotvec(increment[3:])
-        places.append(place)
-    return np.array(places)

@@ -30,7 +30,7 @@ class Table(NamedTuple):
 
     path: Path
     columns: dict[str, np.ndarray]
-    """int64 for whole numbers, float64 for real ones, which are finite."""
+    """int64 for whole numbers, float64 for real ones, which are finite, or NaN in columns where that is allowed."""
 
     def __getitem__(self, name: str) -> np.ndarray:  # type: ignore[override]
         """A column by its name."""
@@ -53,13 +53,16 @@ class Table(NamedTuple):
             raise ValueError(f"{self.place(int(rows[0]))}, column {name}: {value} {remedy} ({len(rows)} such rows)")
 
 
-def read_table(path: str | os.PathLike, kinds: Mapping[str, Kind], optional: Sequence[str] = ()) -> Table:
+def read_table(
+    path: str | os.PathLike, kinds: Mapping[str, Kind], optional: Sequence[str] = (), undefined: Sequence[str] = ()
+) -> Table:
     """Read some columns of a `.csv` or `.parquet` file.
 
     Args:
         path: the file; its ending tells its format.
         kinds: the columns, each of whole or of real numbers; spaces around names in a header do not count.
         optional: those that may be absent; they are then absent in the table too.
+        undefined: columns of real numbers in which nan may stand, for what nobody knows.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -79,7 +82,8 @@ def read_table(path: str | os.PathLike, kinds: Mapping[str, Kind], optional: Seq
     table = Table(path, columns)
     for name, column in columns.items():
         if column.dtype.kind == "f":
-            table.refuse_where(~np.isfinite(column), name, "is not finite; leave out rows that measure nothing")
+            is_bad = np.isinf(column) if name in undefined else ~np.isfinite(column)
+            table.refuse_where(is_bad, name, "is not finite; leave out rows that measure nothing")
     return table
 
 

@@ -82,6 +82,22 @@ def read_kitti(path: str | os.PathLike) -> Poses:
     return poses_of(rows.reshape(-1, 3, 4), [f"{path}, line {line}" for line in lines])
 
 
+def read_trajectory(path: str | os.PathLike) -> tuple[Float[np.ndarray, " T"] | None, Poses]:
+    """Read a trajectory in the format of TUM or KITTI, as its first line tells: times, or None, and poses.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: as `read_tum` and `read_kitti`; and for a first line of neither length, or none.
+    """
+    _, rows = read_words(path)
+    length = len(rows[0]) if rows else 0
+    if length == 12:
+        return None, read_kitti(path)
+    if length == 8:
+        return read_tum(path)
+    raise ValueError(f"{path}: {length} words in its first line; TUM's format has 8 numbers, KITTI's 12.")
+
+
 def poses_of(matrices: Float[np.ndarray, "T 3 4"], places: list[str]) -> Poses:
     """Poses of matrices [R t]; refused by its place where R is no rotation within 1 %."""
     from scipy.spatial.transform import Rotation

@@ -67,6 +67,17 @@ def precision_at(
     return np.where(np.isnan(recall[:, -1:]), np.nan, np.take_along_axis(best, places, axis=1))
 
 
+def area(tracks: Tracks, weights: Float[np.ndarray, "b seed"] | None = None) -> Float[np.ndarray, " b"]:
+    """Area under the ROC of each resample: the share of pairs of a mover and another in the right order, ties half.
+
+    Arguments as of `recall_at`. NaN where there are no pairs.
+    """
+    hits, false = _counts(tracks, weights)
+    pairs = hits[:, -1] * false[:, -1]
+    under = np.sum(np.diff(false, axis=1) * (hits[:, 1:] + hits[:, :-1]) / 2, axis=1)
+    return np.where(pairs > 0, under / np.where(pairs > 0, pairs, 1.0), np.nan)
+
+
 def resampled(
     curve: Callable[..., np.ndarray], tracks: Tracks, levels: Float[np.ndarray, " r"], num: int = NUM_RESAMPLES
 ) -> Float[np.ndarray, "b r"]:

@@ -1,0 +1,128 @@
+"""Pictures of features: the colours are where the features are, and tell what was said of them."""
+
+import cv2
+import numpy as np
+import PIL.Image
+import pytest
+import recorded
+
+from vcjax.report.feature_pictures import _LEGEND_PX, STATUSES, FeaturePictures
+from vcjax.report.path_view import path_figure
+from vcjax.sources.map_file import CLASS_COLOURS, LandmarkMap
+from vcjax.sources.tracks import tracks_of
+from vcjax.study.verdicts import Verdicts, verdicts
+
+
+def passed() -> Verdicts:
+    return verdicts(recorded.run().info)
+
+
+def drawn(content=None) -> FeaturePictures:
+    return FeaturePictures(content or recorded.content(), passed(), recorded.recording_path().parent, width_px=640)
+
+
+def rgb(picture) -> np.ndarray:
+    return np.asarray(picture.convert("RGB"))
+
+
+def around(image, uv_px, scale) -> set:
+    """Colours within 8 pixels of a feature."""
+    u, v = np.rint((np.asarray(uv_px) + 0.5) * scale).astype(int)
+    v += _LEGEND_PX
+    return {tuple(map(int, c)) for c in image[max(v - 8, 0) : v + 9, max(u - 8, 0) : u + 9].reshape(-1, 3)}
+
+
+def test_each_feature_has_the_colour_of_its_verdict():
+    pictures, told = drawn(), passed()
+    content = recorded.content()
+    tracks = tracks_of(content.recording, content.calibration)
+    seen = set()
+    for t in range(30):
+        image = rgb(pictures.picture(t))
+        assert image.shape == (480 + _LEGEND_PX, 640, 3)
+        for row in np.flatnonzero((told.frame == t) & (told.verdict < 3)):
+            uv_px = tracks.uv_px[(tracks.frame == t) & (tracks.track_id == told.track_id[row])]
+            if len(uv_px):
+                name = STATUSES[told.verdict[row]]
+                assert CLASS_COLOURS[name] in around(image, uv_px[0], 2), (t, name)
+                seen.add(name)
+    assert seen >= {"accepted", "dynamic"}
+
+
+def test_what_was_called_dynamic_is_remembered():
+    pictures, told = drawn(), passed()
+    row = np.flatnonzero(told.verdict == 2)[0]
+    t, track = int(told.frame[row]), told.track_id[row]
+    tracks = tracks_of(recorded.content().recording)
+
+    def of(frame):
+        ids = np.sort(tracks.track_id[tracks.frame == frame])
+        return pictures.seen(frame).was_dynamic[np.flatnonzero(ids == track)]
+
+    assert not of(t).any() and of(t + 1).all()
+    assert len(pictures.seen(t).status) == (tracks.frame == t).sum()
+
+
+def test_the_image_is_there():
+    """Greys of the picture are those of the image, where nothing is drawn."""
+    picture = rgb(drawn().picture(0, 1.0))[_LEGEND_PX:]
+    image = cv2.imread(recorded.content().image_paths[0], cv2.IMREAD_GRAYSCALE)
+    is_grey = (picture[..., 0] == picture[..., 1]) & (picture[..., 1] == picture[..., 2])
+    assert is_grey.mean() > 0.8
+    assert np.mean(np.abs(picture[..., 0].astype(int) - image)[is_grey] <= 2) > 0.85
+
+
+def test_plain_axes_without_images():
+    content = recorded.content()._replace(image_paths=None)
+    image = rgb(drawn(content).picture(0))
+    assert image.shape == (480 + _LEGEND_PX, 640, 3) and np.median(image) == 255
+    told = recorded.content()._replace(image_paths=("nowhere.png",) * 30)
+    pictures = drawn(told)
+    assert pictures.missing_image() == recorded.recording_path().parent / "nowhere.png"
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.png: no such image"):
+        pictures.picture(0)
+    pictures.on_plain_axes()
+    np.testing.assert_array_equal(rgb(pictures.picture(0)), image)
+    assert drawn().missing_image() is None
+
+
+def test_image_of_another_size_is_refused(tmp_path):
+    path = tmp_path / "small.png"
+    cv2.imwrite(str(path), np.zeros((10, 20), np.uint8))
+    with pytest.raises(ValueError, match=r"small\.png: 20 × 10 pixels, but the calibration is of 320 × 240"):
+        drawn(recorded.content()._replace(image_paths=(str(path),) * 30)).picture(0)
+
+
+def test_animations_hold_the_frames(tmp_path):
+    pictures, done = drawn(), []
+    path = pictures.write_animation(range(0, 30, 3), tmp_path / "a.gif", lambda *counts: done.append(counts))
+    with PIL.Image.open(path) as gif:
+        assert gif.n_frames == 10 and gif.size == (640, 480 + _LEGEND_PX) and gif.info["duration"] == 100
+        gif.seek(9)
+        colours = {tuple(map(int, c)) for c in np.unique(rgb(gif).reshape(-1, 3), axis=0)}
+        assert CLASS_COLOURS["accepted"] in colours
+    assert done[-1] == (10, 10)
+    video = cv2.VideoCapture(str(pictures.write_animation(range(5), tmp_path / "a.mp4")))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 5 and video.get(cv2.CAP_PROP_FPS) == pytest.approx(10)
+    video.release()
+    with pytest.raises(ValueError, match=r"unknown ending '\.avi'"):
+        pictures.write_animation([0], tmp_path / "a.avi")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gif", "a.mp4"]
+
+
+def test_path_from_above_shows_what_there_is():
+    path = np.tile([0.0, 0, 0, 1, 0, 0, 0], (5, 1))
+    path[:, 0] = np.arange(5)
+    places = np.array([[2.0, 1.0, 0.0], [4.0, -2.0, 0.0], [1e4, 0.0, 0.0]])
+    cov = np.stack([0.01 * np.eye(3), 0.01 * np.eye(3), 1e8 * np.eye(3)])
+    landmarks = LandmarkMap(np.arange(3), places, cov, ("accepted", "dynamic", "unused"))
+    truth = path.copy()
+    truth[2:] = np.nan
+    axes = path_figure(path, landmarks, odometry=path, truth=truth).axes[0]
+    assert axes.get_title() == "Path and landmarks from above; 1 landmarks lie farther away"
+    names = set(axes.get_legend_handles_labels()[1])
+    assert names == {"accepted (1)", "dynamic (1)", "odometry alone", "truth", "filter"}
+    assert axes.get_xlim()[0] < 0 and 4 < axes.get_xlim()[1] < 10 and axes.get_ylim()[0] < -2
+    assert len(axes.patches) == 2
+    nothing = LandmarkMap(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)), ())
+    assert path_figure(path, nothing).axes[0].get_title() == "Path and landmarks from above"

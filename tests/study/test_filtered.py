@@ -1,0 +1,78 @@
+"""Recordings filtered frame by frame: the numbers of one scan, and the map that a scan forgets."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import recorded
+from quick import QUICK
+from tiny_runs import compilations
+
+import vcjax as vc
+from vcjax.filter.state import landmark_cov
+from vcjax.study.filtered import filter_recording
+
+run_once = jax.jit(vc.run, compiler_options=QUICK)
+
+
+def test_infos_and_map_are_those_of_one_scan():
+    recording, found = recorded.content().recording, recorded.run()
+    state, info = run_once(recorded.config(), recording)
+    for field in dataclasses.fields(info):
+        one, other = (np.asarray(getattr(x, field.name)) for x in (found.info, info))
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-8, err_msg=field.name)
+    # Those that the map still holds, worked out anew: p₀ + m/ρ, and its covariance by differences.
+    held = np.flatnonzero(np.asarray(state.track_id) >= 0)
+    landmarks, cov = np.asarray(state.landmarks)[held], np.asarray(landmark_cov(state))[held]
+
+    def point(x):
+        return x[:3] + x[3:6] / x[6]
+
+    places = dict(zip(found.landmarks.track_id.tolist(), found.landmarks.place_m, strict=True))
+    covs = dict(zip(found.landmarks.track_id.tolist(), found.landmarks.cov, strict=True))
+    assert len(held) > 5
+    for track, x, P in zip(np.asarray(state.track_id)[held].tolist(), landmarks, cov, strict=True):
+        J = np.stack([(point(x + step) - point(x - step)) / 2e-6 for step in 1e-6 * np.eye(7)], axis=1)
+        np.testing.assert_allclose(places[track], point(x), atol=1e-8 * np.abs(point(x)).max())
+        np.testing.assert_allclose(covs[track], J @ P @ J.T, atol=1e-4 * np.abs(covs[track]).max())
+
+
+def test_landmarks_that_left_the_map_stay_known():
+    """By the frame that held them last: a run over the frames until then ends with the same place."""
+    recording, found = recorded.content().recording, recorded.run()
+    ids = found.info.track_id
+    born = np.unique(ids[ids >= 0])
+    np.testing.assert_array_equal(found.landmarks.track_id, born)
+    gone = [track for track in born.tolist() if track not in ids[-1]]
+    last = {track: int(np.flatnonzero(np.any(ids == track, axis=1))[-1]) for track in gone}
+    track = next(track for track in gone if 5 < last[track] < 20)
+    part = jax.tree.map(lambda x: x, recording)
+    names = [f.name for f in dataclasses.fields(part) if np.ndim(getattr(part, f.name)) and f.name != "camera"]
+    cut = {n: getattr(part, n)[: last[track] + 1] for n in names if len(getattr(part, n)) == recording.num_frames}
+    until = filter_recording(recorded.config(), dataclasses.replace(part, **cut | {"is_last": cut["is_last"]}))
+    index, end = (np.flatnonzero(x.landmarks.track_id == track)[0] for x in (found, until))
+    np.testing.assert_allclose(found.landmarks.place_m[index], until.landmarks.place_m[end], rtol=1e-9)
+    np.testing.assert_allclose(found.landmarks.cov[index], until.landmarks.cov[end], rtol=1e-6, atol=1e-12)
+
+
+def test_another_threshold_compiles_nothing_and_progress_ends_with_the_last_frame():
+    recorded.run()
+    done = []
+    with compilations() as compiled:
+        strict = recorded.config(gate=vc.VirtualCorrection(th1=2.0, th2=1.0))
+        found = filter_recording(strict, recorded.content().recording, lambda *counts: done.append(counts))
+    assert compiled.num == 0 and done[-1] == (30, 30)
+    assert found.info.is_dynamic.sum() > recorded.run().info.is_dynamic.sum()
+    assert found.compile_s >= 0 and found.run_s > 0
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_cannot_be_run_is_refused():
+    recording = recorded.content().recording
+    with pytest.raises(ValueError, match=r"birth_order='random'\): births of recordings go by id"):
+        filter_recording(recorded.config(birth_order="random"), recording)
+    with pytest.raises(ValueError, match=r"odometry\[3, 2\] = nan"):
+        odometry = np.array(recording.odometry)
+        odometry[3, 2] = np.nan
+        filter_recording(recorded.config(), dataclasses.replace(recording, odometry=odometry))

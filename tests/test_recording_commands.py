@@ -1,0 +1,347 @@
+"""The commands for recordings: from images to tracks, run and evaluation, against exact truth; and what they refuse."""
+
+import json
+import shutil
+import zipfile
+
+import jax
+import jaxtyping
+import numpy as np
+import pytest
+import recorded
+from rendered import rendered, tracked
+from told import assert_one_line, said
+
+import vcjax as vc
+from vcjax.cli import main
+from vcjax.sources.recording_file import load_recording, save_recording
+from vcjax.sources.table_file import write_table
+from vcjax.sources.table_recording import write_labels
+from vcjax.sources.tracks import read_tracks, write_tracks
+from vcjax.sources.trajectory_file import read_tum, write_kitti, write_tum
+
+pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
+
+
+@pytest.fixture(scope="module")
+def folder():
+    """The rendered images, as `plain_folder` finds them."""
+    return rendered().sequence.paths[0].parent.parent
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """What `vcjax run` has written."""
+    out = tmp_path_factory.mktemp("run") / "vc"
+    jaxtyping.config.update("jaxtyping_disable", True)  # as `unchecked` does for a test
+    try:
+        command = ["run", str(recorded.recording_path()), *recorded.OPTIONS, "--out", str(out), "--pictures", "2"]
+        assert main(command) == 0
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+    return out
+
+
+def contents(path) -> dict:
+    return {str(p.relative_to(path)): p.read_bytes() for p in path.rglob("*") if p.is_file()}
+
+
+def test_images_become_a_recording(folder, tmp_path, capsys):
+    out = tmp_path / "tracks.npz"
+    assert main(["track", str(folder), "--out", str(out)]) == 0
+    printed, told = said(capsys)
+    assert "frames          30 in 2.9 s" in printed and f"wrote {out}" in told
+    found, expected = load_recording(out), recorded.content()
+    np.testing.assert_array_equal(found.recording.track_id, expected.recording.track_id)
+    np.testing.assert_array_equal(found.recording.uv_px, expected.recording.uv_px)
+    np.testing.assert_allclose(found.truth.robot, expected.truth.robot, atol=1e-9)
+    assert found.image_paths == expected.image_paths and found.calibration == expected.calibration
+    options = ["--first", "10", "--last", "20", "--max-features", "20", "--out", str(out)]
+    assert main(["track", str(folder), *options]) == 0
+    part = load_recording(out)
+    assert part.recording.num_frames == 10 and part.recording.is_valid.sum(axis=1).max() <= 20
+
+
+def test_images_without_anything_need_calibration_and_rate(folder, tmp_path, capsys):
+    images = tmp_path / "images"
+    images.mkdir()
+    for path in rendered().sequence.paths[:4]:
+        shutil.copy(path, images)
+    calibration = folder / "calibration.json"
+    command = ["track", str(images), "--out", str(tmp_path / "a.npz")]
+    assert main([*command, "--calibration", str(calibration)]) == 1
+    assert_one_line(said(capsys)[1], "give times.csv in the folder or rate_hz")
+    assert main([*command, "--calibration", str(calibration), "--rate-hz", "20", "--speed-std-m-s", "0.3"]) == 0
+    recording = load_recording(tmp_path / "a.npz").recording
+    np.testing.assert_allclose(np.diff(recording.time_s), 0.05)
+    np.testing.assert_allclose(recording.odometry_cov[1:, 0, 0], (0.3 * 0.05) ** 2)
+
+
+def test_start_at_the_truth(folder, tmp_path, capsys):
+    """Without odometry, where the first image is the start: the pose of the truth there."""
+    copy = tmp_path / "sequence"
+    shutil.copytree(folder, copy)
+    command = ["track", str(copy), "--start", "truth", "--out", str(tmp_path / "a.npz")]
+    assert main(command) == 1
+    assert_one_line(said(capsys)[1], "the odometry moves before the first image")
+    (copy / "odometry.csv").unlink()
+    assert main(command) == 0
+    found = load_recording(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found.recording.robot_start, found.truth.robot[0])
+    (copy / "groundtruth.txt").unlink()
+    said(capsys)
+    assert main(command) == 1
+    assert_one_line(said(capsys)[1], "has no true pose of the first image")
+
+
+def test_tables_become_a_recording(folder, tmp_path, capsys):
+    tracks = write_tracks(tmp_path / "tracks.csv", tracked())
+    known = ["--calibration", str(folder / "calibration.json"), "--out", str(tmp_path / "a.npz")]
+    assert main(["record", str(tracks), *known]) == 1
+    assert_one_line(said(capsys)[1], "give --times or --rate-hz, one of the two")
+    known += ["--times", str(folder / "times.csv"), "--odometry", str(folder / "odometry.csv"), "--truth-of", "camera"]
+    labels = write_labels(tmp_path / "labels.csv", recorded.content().labels)
+    assert (
+        main(["record", str(tracks), *known, "--truth", str(folder / "groundtruth.txt"), "--labels", str(labels)]) == 0
+    )
+    assert "poses of 30 frames" in said(capsys)[0]
+    found = load_recording(tmp_path / "a.npz")
+    np.testing.assert_array_equal(found.recording.uv_px, recorded.content().recording.uv_px)
+    np.testing.assert_allclose(found.truth.robot, recorded.content().truth.robot, atol=1e-9)
+    np.testing.assert_array_equal(found.labels.label, recorded.content().labels.label)
+
+
+def test_inspect_prints_and_draws(tmp_path, capsys):
+    path = tmp_path / "a.npz"
+    shutil.copy(recorded.recording_path(), path)
+    assert main(["inspect", str(path)]) == 0
+    printed, told = said(capsys)
+    assert "truth           poses of 30 frames" in printed and "moving" in printed
+    assert (tmp_path / "a_overview.png").stat().st_size > 10_000 and f"wrote {tmp_path / 'a_overview.png'}" in told
+    assert main(["inspect", str(path), "--picture", str(tmp_path / "b" / "c.png")]) == 0
+    assert (tmp_path / "b" / "c.png").exists()
+
+
+def test_run_writes_all_that_there_is_to_see(results, capsys):
+    names = set(contents(results))
+    assert names == {
+        "robot_tum.txt", "robot_kitti.txt", "camera_tum.txt", "camera_kitti.txt", "landmarks.ply", "landmarks.csv",
+        "verdicts.csv", "tracks.csv", "summary.json", "path.png", "features.gif", "features/000014.png",
+        "features/000029.png",
+    }  # fmt: skip
+    summary = json.loads((results / "summary.json").read_text())
+    assert summary["recording"] == str(recorded.recording_path()) and summary["failures"] == 0
+    assert summary["config"]["gate"]["th1"] == 9.0 and summary["frames"] == 30
+    # The truth is exact: 0.9 m on, the path ends within 5 cm of it.
+    _, robot = read_tum(results / "robot_tum.txt")
+    assert np.linalg.norm(robot[-1, :3] - rendered().truth.robot[-1, :3]) < 0.05
+    # The camera of the rendered sequence swings on the robot by 10 cm; so does the estimate.
+    _, camera = read_tum(results / "camera_tum.txt")
+    assert 0.08 < np.ptp(camera[:, 1] - robot[:, 1]) < 0.12
+
+
+def test_evaluate_finds_the_movers_and_names_every_alignment(results, tmp_path, capsys):
+    assert main(["evaluate", str(results), "--out", str(tmp_path / "a.txt")]) == 0
+    printed, _ = said(capsys)
+    assert (tmp_path / "a.txt").read_text() == printed
+    own, alone, movers = printed.split("\n\n")
+    assert own.startswith("compared                   30 poses") and alone.startswith("odometry alone")
+    error = np.linalg.norm(read_tum(results / "robot_tum.txt")[1][:, :3] - rendered().truth.robot[:, :3], axis=1)
+    assert f"APE, not aligned           {np.sqrt(np.mean(error**2)):.4g} m RMS" in own
+    words = movers.splitlines()[0].split()
+    assert int(words[1]) >= 3 and float(movers.splitlines()[5].split()[1]) > 0.7
+    # The same by a trajectory file and by true poses in a file, in both formats.
+    truth = np.asarray(rendered().truth.robot)
+    write_tum(tmp_path / "true.txt", recorded.content().recording.time_s, truth)
+    write_kitti(tmp_path / "true_kitti.txt", truth)
+    for estimate, true in (("robot_tum.txt", "true.txt"), ("robot_kitti.txt", "true_kitti.txt"), (".", "true.txt")):
+        assert main(["evaluate", str(results / estimate), "--truth", str(tmp_path / true)]) == 0
+        assert said(capsys)[0].splitlines()[:5] == own.splitlines()[:5]
+
+
+def test_run_and_simulate_meet(tmp_path, capsys):
+    """A seed's recording on disk, run by itself, gives what the batch gave."""
+    # As small as in test_commands.py, which compiles the same.
+    options = "--num-frames 12 --max-landmarks 24 --max-updates 6 --dynamic lateral --seeds 3"
+    runs, recording = tmp_path / "runs.nc", tmp_path / "first.npz"
+    assert main(["simulate", *options.split(), "--out", str(runs), "--recording", str(recording), "--key", "7"]) == 0
+    assert f"wrote {recording}" in said(capsys)[1]
+    content = load_recording(recording)
+    scenario = vc.scenarios.paper(dynamic="lateral", num_frames=12)
+    expected, truth = vc.simulate(scenario, jax.random.fold_in(jax.random.key(7), 0))
+    np.testing.assert_allclose(content.recording.uv_px, expected.uv_px, atol=1e-9)
+    np.testing.assert_allclose(content.truth.robot, truth.robot, atol=1e-12)
+    from vcjax.study.results import load
+
+    command = ["run", str(recording), "--max-landmarks", "24", "--max-updates", "6", "--out", str(tmp_path / "run")]
+    assert main([*command, "--animation", "none", "--pictures", "1"]) == 0
+    _, robot = read_tum(tmp_path / "run" / "robot_tum.txt")
+    np.testing.assert_allclose(robot, load(runs).robot.values[0], atol=1e-9)
+    assert main(["evaluate", str(tmp_path / "run")]) == 0
+    assert "(6 labelled)" in said(capsys)[0]
+
+
+def test_missing_images_are_told_and_drawn_without(tmp_path, capsys):
+    path = save_recording(tmp_path / "a.npz", recorded.content()._replace(image_paths=("gone.png",) * 30))
+    command = ["run", str(path), *recorded.OPTIONS, "--animation", "none", "--out", str(tmp_path / "run")]
+    assert main(command) == 0
+    assert f"{tmp_path / 'gone.png'}: no such image; features are drawn on plain axes." in said(capsys)[1]
+
+
+def test_damaged_image_leaves_the_results_before(results, tmp_path, capsys):
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    paths = (*recorded.content().image_paths[:29], "bad.png")
+    path = save_recording(tmp_path / "a.npz", recorded.content()._replace(image_paths=paths))
+    out = tmp_path / "run"
+    shutil.copytree(results, out)
+    before = contents(out)
+    assert main(["run", str(path), *recorded.OPTIONS, "--out", str(out)]) == 1
+    assert_one_line(said(capsys)[1].splitlines()[-1], "bad.png: no image that can be read")
+    assert contents(out) == before
+
+
+def changed(path, out, name, array):
+    """A recording file with one array replaced, as somebody else's program may write it."""
+    with zipfile.ZipFile(path) as archive:
+        arrays = {n.removesuffix(".npy"): np.load(archive.open(n)) for n in archive.namelist()}
+    np.savez_compressed(out, **arrays | {name: array(arrays[name].copy())})
+    return out
+
+
+def nan_pixel(uv_px):
+    uv_px[4, 2] = np.nan
+    return uv_px
+
+
+def negative_id(track_id):
+    track_id[5, 1] = -3
+    return track_id
+
+
+HOSTILE = {
+    "NaN": (("uv_px", nan_pixel), ["Recording(uv_px[4, 2, 0] = nan)", "clear is_valid there"]),
+    "negative id": (("track_id", negative_id), ["Recording(track_id[5, 1] = -3)", "ids start at 0"]),
+    "whole pixels": (("uv_px", lambda a: a.astype(int)), ["uv_px is int64; floating-point numbers are needed"]),
+    "endless covariance": (("odometry_cov", lambda a: a + np.inf), ["odometry_cov[0, 0, 0]", "must be finite"]),
+    "times that stand": (("time_s", lambda a: a * 0 + 1), ["time_s[1] = 1.0", "times must grow"]),
+    "label of nobody's": (("label", lambda a: a + 7), ["label[0] = ", "give one of -1 UNKNOWN"]),
+    "calibration of words": (("calibration", lambda _: np.asarray("{}")), ["calibration: lacks width"]),
+}
+
+
+@pytest.mark.parametrize("command", ["inspect", "run", "evaluate"])
+@pytest.mark.parametrize(("change", "words"), HOSTILE.values(), ids=HOSTILE)
+def test_hostile_recording_is_refused_in_one_line(change, words, command, results, tmp_path, capsys):
+    path = changed(recorded.recording_path(), tmp_path / "bad.npz", *change)
+    out = tmp_path / "out"
+    shutil.copytree(results, out)
+    before = contents(tmp_path)
+    arguments = {
+        "inspect": [str(path)],
+        "run": [str(path), "--out", str(out)],
+        "evaluate": [str(out), "--truth", str(path), "--out", str(tmp_path / "report.txt")],
+    }
+    assert main([command, *arguments[command]]) == 1
+    printed, told = said(capsys)
+    assert printed == ""
+    assert_one_line(told, "bad.npz", *words)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("command", ["inspect", "run"])
+def test_truncated_recording(command, tmp_path, capsys):
+    whole = recorded.recording_path().read_bytes()
+    (tmp_path / "bad.npz").write_bytes(whole[: len(whole) // 2])
+    assert main([command, str(tmp_path / "bad.npz")]) == 1
+    assert_one_line(said(capsys)[1], "bad.npz: not a sound .npz file")
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.npz"]
+
+
+def test_images_of_changing_size(folder, tmp_path, capsys):
+    import cv2
+
+    copy = tmp_path / "sequence"
+    shutil.copytree(folder, copy)
+    cv2.imwrite(str(copy / "images" / "00017.png"), np.zeros((240, 321), np.uint8))
+    out = tmp_path / "a.npz"
+    out.write_bytes(b"what was there")
+    assert main(["track", str(copy), "--out", str(out)]) == 1
+    assert_one_line(said(capsys)[1].splitlines()[-1], "00017.png: 321 × 240 pixels", "320 × 240")
+    (copy / "images" / "00017.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"\0" * 40)
+    assert main(["track", str(copy), "--out", str(out)]) == 1
+    assert_one_line(said(capsys)[1].splitlines()[-1], "00017.png: no image that can be read")
+    assert out.read_bytes() == b"what was there"
+
+
+@pytest.mark.parametrize(("ending", "place"), [("csv", "line 765434"), ("parquet", "row 765433")])
+def test_million_rows_with_one_bad_cell(tmp_path, ending, place):
+    """Said by its place, in the time that reading takes."""
+    num = 1_000_000
+    columns = {"frame": np.arange(num) // 50, "track_id": np.arange(num) % 50, "u": np.zeros(num), "v": np.zeros(num)}
+    columns["u"][765432] = np.nan
+    path = write_table(tmp_path / f"tracks.{ending}", columns)
+    with pytest.raises(ValueError, match=rf"tracks\.{ending}, {place}, column u: nan is not finite"):
+        read_tracks(path)
+    columns["u"][765432], columns["track_id"][765432] = 0.0, -1
+    with pytest.raises(ValueError, match=rf"{place}, column track_id: -1 is below 0"):
+        read_tracks(write_table(path, columns))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("run", ["PATH"]),
+        ("run nowhere.npz", ["nowhere.npz: no such file"]),
+        ("run {recording} --gate XX", ["'XX'", "'RE', 'VC'"]),
+        ("run {recording} --gate RE --th2 3", ["--th2"]),
+        ("run {recording} --th1 -1", ["VirtualCorrection(th1=-1.0)"]),
+        ("run {recording} --out file", ["file is a file"]),
+        ("run {recording} --pictures -1", ["--pictures -1: give a whole number of at least 0"]),
+        ("run {recording} --animation-frames 0", ["--animation-frames 0: give at least 1, or --animation none"]),
+        ("run {recording} --animation avi", ["'avi'"]),
+        ("run {recording} --birth-order random", ["birth_order='random'"]),
+        ("run file", ["file: not a sound .npz file"]),
+        ("inspect nowhere.npz", ["nowhere.npz: no such file"]),
+        ("inspect {recording} --picture folder", ["folder is a directory"]),
+        ("track nowhere", ["nowhere: no such folder"]),
+        ("track folder", ["folder: no image in it"]),
+        ("track folder --first -1", ["--first -1"]),
+        ("track folder --step 0", ["--step 0"]),
+        ("track folder --first 3 --last 3", ["--last 3: give a number above --first 3"]),
+        ("track folder --window-px 4", ["FrontEnd(window_px=4)", "odd"]),
+        ("track folder --layout tumb", ["'tumb'"]),
+        ("evaluate folder", ["no complete run here", "run `vcjax run` first"]),
+        ("evaluate file", ["file: names no recording; give --truth"]),
+        ("evaluate file --truth {recording}", ["3 words in its first line"]),
+        ("evaluate nowhere --truth {recording}", ["nowhere: no such file"]),
+        ("simulate --recording folder", ["folder is a directory; give the name of a file"]),
+    ],
+)
+def test_what_is_refused_is_said_clearly(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "400")
+    (tmp_path / "file").write_text("not a folder")
+    (tmp_path / "folder").mkdir()
+    try:
+        status = main(arguments.format(recording=recorded.recording_path()).split())
+    except SystemExit as stop:
+        status = int(stop.code)
+    printed, told = said(capsys)
+    assert status in (1, 2) and printed == "" and "Traceback" not in told
+    if status == 1:
+        assert_one_line(told, *words)
+    else:
+        assert all(word in told for word in words), told
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "folder"}
+
+
+def test_evaluate_without_anything_to_compare_with(results, tmp_path, capsys):
+    bare = save_recording(tmp_path / "bare.npz", recorded.content().recording)
+    assert main(["evaluate", str(results), "--truth", str(bare)]) == 1
+    assert_one_line(said(capsys)[1], "bare.npz: holds neither true poses nor labels")
+    copy = tmp_path / "run"
+    shutil.copytree(results, copy)
+    summary = json.loads((copy / "summary.json").read_text())
+    (copy / "summary.json").write_text(json.dumps(summary | {"recording": str(tmp_path / "gone.npz")}))
+    assert main(["evaluate", str(copy)]) == 1
+    assert_one_line(said(capsys)[1], "gone.npz, which was run: no such file; give --truth")

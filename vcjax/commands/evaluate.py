@@ -1,0 +1,79 @@
+"""`vcjax evaluate`: a trajectory, or all of a run, against the truth."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from vcjax.commands.console import say
+from vcjax.sources.odometry import dead_reckoning
+from vcjax.sources.recording_file import RecordingFile, load_recording
+from vcjax.sources.trajectory_file import read_trajectory
+from vcjax.storage import check_writable, write_file
+from vcjax.study.run_folder import RunFolder, read_run
+from vcjax.study.track_detection import labels_of, track_detection, track_detection_text
+from vcjax.study.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Compare a run or a trajectory with the truth: APE and RPE, every alignment named; and found movers by labels."""
+
+    estimate: tyro.conf.Positional[Path]
+    """Directory of `vcjax run`, or a trajectory in the format of TUM or KITTI."""
+    truth: Path | None = None
+    """Recording with truth (.npz), or true poses of the robot in the format of TUM or KITTI; the recording that was run
+    if not given."""
+    out: Path | None = None
+    """File for what is printed."""
+
+    def __call__(self, console: Console) -> None:
+        """Read, compare, print."""
+        if self.out is not None:
+            check_writable(self.out)
+        run = read_run(self.estimate) if self.estimate.is_dir() else None
+        path = self._truth_path(run)
+        estimate = Trajectory(run.robot, run.time_s) if run is not None else _trajectory(self.estimate)
+        content = load_recording(path) if path.suffix.lower() == ".npz" else None
+        truth = _trajectory(path) if content is None else _true_path(content)
+        parts = []
+        if truth is not None:
+            parts.append(trajectory_error_text(trajectory_error(estimate, truth)))
+        if content is not None and truth is not None and np.any(np.asarray(content.recording.odometry)):
+            alone = Trajectory(dead_reckoning(content.recording), np.asarray(content.recording.time_s))
+            parts.append(f"odometry alone\n{trajectory_error_text(trajectory_error(alone, truth))}")
+        labels = None if content is None else labels_of(content)
+        if run is not None and labels is not None:
+            parts.append(track_detection_text(track_detection(run.tracks, labels)))
+        if not parts:
+            raise ValueError(f"{path}: holds neither true poses nor labels of tracks; give --truth with another file.")
+        text = "\n\n".join(parts)
+        print(text)
+        if self.out is not None:
+            say(console, f"wrote {write_file(self.out, f'{text}{chr(10)}'.encode())}")
+
+    def _truth_path(self, run: RunFolder | None) -> Path:
+        """The file of the truth."""
+        if self.truth is not None:
+            return self.truth
+        recording = None if run is None else run.summary.get("recording")
+        if not isinstance(recording, str):
+            raise ValueError(f"{self.estimate}: names no recording; give --truth, a recording or a trajectory.")
+        if not Path(recording).is_file():
+            raise FileNotFoundError(f"{recording}, which was run: no such file; give --truth.")
+        return Path(recording)
+
+
+def _trajectory(path: Path) -> Trajectory:
+    """A trajectory from a file."""
+    time_s, poses = read_trajectory(path)
+    return Trajectory(poses, time_s)
+
+
+def _true_path(content: RecordingFile) -> Trajectory | None:
+    """True poses of the robot, as far as a recording knows them."""
+    if content.truth is None:
+        return None
+    return Trajectory(np.asarray(content.truth.robot, np.float64), np.asarray(content.recording.time_s, np.float64))

@@ -1,0 +1,112 @@
+"""One filtered recording in numbers: speed, updates, verdicts, consistency, failures."""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vcjax.filter.config import FilterConfig
+from vcjax.filter.info import FrameInfo
+from vcjax.recording import Recording
+from vcjax.study.filtered import Filtered
+from vcjax.study.verdicts import ACCEPTED, DELETED, DYNAMIC, RECOVERED, REJECTED, TrackVerdicts
+
+
+def first_failure(info: FrameInfo) -> int | None:
+    """The first frame whose vehicle is not finite; None where all are."""
+    failed = np.flatnonzero(~np.asarray(info.is_finite))
+    return int(failed[0]) if len(failed) else None
+
+
+def run_summary(
+    config: FilterConfig, recording: Recording, filtered: Filtered, tracks: TrackVerdicts
+) -> dict[str, Any]:
+    """Numbers of a run, by name; times in s. NaN where there is nothing to say.
+
+    `nis` is the mean normalised innovation squared of the accepted updates, z ᵀ Z⁻¹ z with 2 degrees of freedom. The
+    gate cuts off what is not below t, its threshold, so in a consistent filter it has the mean and the variance of χ²₂
+    below t; `nis_low` and `nis_high` hold 95 % of the means of as many independent ones. `beyond_gate` is the share of
+    measurements at or above the threshold, exp(-t/2) in a consistent filter of a static scene.
+
+    Source: Bar-Shalom, Li, Kirubarajan 2001, section 5.4, for the test.
+    """
+    info = filtered.info
+    accepted = np.asarray(info.is_accepted)
+    num_measured, num_accepted = int(np.sum(info.is_measured)), int(accepted.sum())
+    limit = float(config.gate.margin(jnp.zeros(())))
+    mean, variance = nis_moments(limit)
+    half = 1.96 * math.sqrt(variance / num_accepted) if num_accepted else math.nan
+    time_s = np.asarray(recording.time_s, np.float64)
+    failure = first_failure(info)
+    counts = tracks.counts.sum(axis=0)
+    duration_s = float(np.ptp(time_s))
+    return {
+        "frames": recording.num_frames,
+        "duration_s": duration_s,
+        "compile_s": filtered.compile_s,
+        "run_s": filtered.run_s,
+        "times_real_time": duration_s / filtered.run_s if duration_s else math.nan,
+        "measured": num_measured,
+        "accepted": int(counts[ACCEPTED]),
+        "recovered": int(counts[RECOVERED]),
+        "dynamic": int(counts[DYNAMIC]),
+        "rejected": int(counts[REJECTED]),
+        "deleted": int(counts[DELETED]),
+        "tracks_dynamic": int(np.sum(tracks.is_called)),
+        "landmarks": len(filtered.landmarks.track_id),
+        "nis": float(np.mean(np.asarray(info.re1)[accepted])) if num_accepted else math.nan,
+        "nis_low": mean - half,
+        "nis_high": mean + half,
+        "beyond_gate": 1.0 - num_accepted / num_measured if num_measured else math.nan,
+        "beyond_gate_expected": math.exp(-limit / 2.0),
+        "first_failure": failure,
+        "failures": int(np.sum(~np.asarray(info.is_finite))),
+        "frames_map_full": int(np.sum(info.map_is_full)),
+    }
+
+
+def nis_moments(limit: float) -> tuple[float, float]:
+    """Mean and variance of χ²₂ below a limit t > 0, which is exponential with mean 2 and cut off.
+
+    With τ = t/2 and q = τ e^{-τ}/(1 - e^{-τ}): mean 2 (1 - q), variance 4 (1 - q (q + τ)).
+    """
+    tau = limit / 2.0
+    if not math.isfinite(tau):
+        return 2.0, 4.0
+    q = tau / math.expm1(tau) if tau < 700 else 0.0
+    return 2.0 * (1.0 - q), 4.0 * (1.0 - q * (q + tau))
+
+
+def run_summary_text(found: dict[str, Any]) -> str:
+    """The numbers in words, a line for each thing to know."""
+    within = found["nis_low"] <= found["nis"] <= found["nis_high"]
+    failed = "none" if found["first_failure"] is None else f"not finite from frame {found['first_failure']} on"
+    rows = [
+        ("frames", f"{found['frames']} of {found['duration_s']:.4g} s"),
+        (
+            "speed",
+            f"{found['run_s']:.3g} s, {found['times_real_time']:.3g} times real time; "
+            f"compilation {found['compile_s']:.3g} s",
+        ),
+        ("updates", f"{found['accepted']} accepted, {found['recovered']} recovered of {found['measured']} measured"),
+        (
+            "dynamic",
+            f"{found['dynamic']} verdicts of the gate, {found['deleted']} deletions by the detector, "
+            f"of {found['tracks_dynamic']} tracks",
+        ),
+        ("left out", f"{found['rejected']} rejected without a verdict"),
+        ("landmarks", f"{found['landmarks']} mapped; the map was full in {found['frames_map_full']} frames"),
+        (
+            "mean NIS",
+            f"{found['nis']:.3f} of the accepted; consistent: {found['nis_low']:.3f} to {found['nis_high']:.3f} (95 %)"
+            + ("" if within or not math.isfinite(found["nis"]) else ", which it is not"),
+        ),
+        (
+            "beyond the gate",
+            f"{100 * found['beyond_gate']:.2f} % of the measured; consistent and static: "
+            f"{100 * found['beyond_gate_expected']:.2f} %",
+        ),
+        ("failures", failed),
+    ]
+    return "\n".join(f"{name:16s} {text}" for name, text in rows)
