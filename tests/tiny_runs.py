@@ -10,7 +10,8 @@ import pytest
 from quick import QUICK
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.slam import run, start
+from vcjax.filter.run import run
+from vcjax.filter.slam import start
 from vcjax.gates.gate import AbstractGate
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import Scenario, paper

@@ -13,7 +13,7 @@ from vcjax.filter.known_landmarks import KnownLandmarks as KnownLandmarks
 from vcjax.filter.motion_model import BiasedOdometry as BiasedOdometry
 from vcjax.filter.motion_model import ConstantVelocity as ConstantVelocity
 from vcjax.filter.motion_model import Odometry as Odometry
-from vcjax.filter.slam import run as run
+from vcjax.filter.run import run as run
 from vcjax.filter.slam import start as start
 from vcjax.filter.slam import step as step
 from vcjax.filter.state import FilterState as FilterState

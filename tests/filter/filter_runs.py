@@ -72,7 +72,7 @@ def frame_of(recording: Recording, t: int) -> Frame:
 def filtered(
     config: FilterConfig, recording: Recording, key=None, start=start, step=step
 ) -> Iterator[tuple[FilterState, FrameInfo]]:
-    """State and info (in NumPy) of every frame, as `slam.run` has them; runs of all lengths share their compilation."""
+    """State and info (in NumPy) of every frame, as `run` has them; runs of all lengths share their compilation."""
     state, info = start(config, head(recording, 1), key)
     yield state, jax.device_get(info)
     for t in range(1, recording.num_frames):

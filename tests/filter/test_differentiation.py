@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from filter_runs import CAPACITY, derivative, filtered, frame_of, head, quick_jit, start_jvp, step_jvp
 
-from vcjax.filter import slam
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.run import run
 from vcjax.simulation.scenarios import paper
 from vcjax.simulation.simulate import simulate
 
@@ -112,12 +112,12 @@ def test_forward_mode_is_the_central_difference(k):
 
 @pytest.fixture(scope="module")
 def reverse():
-    """Value and gradient of the summary by reverse mode through `slam.run`, of parameters and `sees`."""
+    """Value and gradient of the summary by reverse mode through `run`, of parameters and `sees`."""
 
     def last_frame(parameters, sees):
         config, recording = inputs(parameters, sees)
         config = dataclasses.replace(config, reverse_mode=True, max_landmarks=40)  # 34 births: enough
-        _, info = slam.run(config, recording)
+        _, info = run(config, recording)
         return summary(info.vehicle[-1], info.vehicle_cov[-1])
 
     return quick_jit(jax.value_and_grad(last_frame))

@@ -22,7 +22,7 @@ IN_FLOAT32 = """
 import json, sys
 import jax, numpy as np
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.slam import run
+from vcjax.filter.run import run
 from vcjax.models.camera import Camera
 from vcjax.recording import Recording
 

@@ -13,7 +13,8 @@ from tiny_runs import CAPACITIES, MOVERS
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.info import FrameInfo
-from vcjax.filter.slam import run, start, step
+from vcjax.filter.run import run
+from vcjax.filter.slam import start, step
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import paper

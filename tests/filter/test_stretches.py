@@ -8,7 +8,7 @@ from tiny_runs import compilations
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.landmark_points import landmark_points
-from vcjax.filter.slam import run
+from vcjax.filter.run import run
 from vcjax.filter.stretches import run_in_stretches
 
 CONFIG = FilterConfig(max_landmarks=23, births_per_frame=2)

@@ -10,7 +10,7 @@ from filter_runs import filtered, frame_of, head, part, recorded, simulate_once,
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.known_landmarks import KnownLandmarks
 from vcjax.filter.motion_model import ConstantVelocity, Odometry
-from vcjax.filter.slam import run
+from vcjax.filter.run import run
 from vcjax.recording import PER_FRAME, last_sightings
 from vcjax.simulation.scenarios import paper
 

@@ -22,7 +22,7 @@ from vcjax.devices import gather, meet, spread
 from vcjax.fields import require_key, require_kind, require_single
 from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.info import FrameInfo
-from vcjax.filter.slam import run
+from vcjax.filter.run import run
 from vcjax.recording import Truth
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import simulate
