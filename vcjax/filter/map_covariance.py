@@ -50,7 +50,7 @@ def read_rows(P_mm: Float[Array, "M M"], slot: Int[Array, " K"]) -> tuple[Float[
 def slot_blocks(P_mm: Float[AnyArray, "M M"]) -> Float[Array, "L 7 7"]:
     """Covariance of each slot with itself, the diagonal blocks."""
     num_slots = P_mm.shape[0] // SLOT
-    blocks = P_mm.reshape(num_slots, SLOT, num_slots, SLOT)
+    blocks = jnp.asarray(P_mm).reshape(num_slots, SLOT, num_slots, SLOT)
     return blocks[jnp.arange(num_slots), :, jnp.arange(num_slots), :]
 
 
