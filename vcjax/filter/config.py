@@ -42,9 +42,6 @@ class FilterConfig(eqx.Module):
     errors: Literal["additive", "invariant"] = eqx.field(static=True, default="additive")
     """What the covariance is of: differences, as in the paper; or errors that turn robot and map together, for long
     paths without a known heading (see `invariant`)."""
-    order: Literal["most_uncertain", "consensus"] = eqx.field(static=True, default="most_uncertain")
-    """In which order the chosen are corrected with: the most uncertain first, as in the paper; or first those that
-    agree with each other, for recordings with outliers and poor odometry (see `consensus`)."""
     iterations: int = eqx.field(static=True, default=1)
     """How often a sequential correction is linearised; 1: once, at the state before it, as the paper does."""
     choose_among: Literal["predicted", "measured"] = eqx.field(static=True, default="predicted")
@@ -118,7 +115,6 @@ class FilterConfig(eqx.Module):
             ("update", ("sequential", "stacked")),
             ("smoothing", SMOOTHINGS),
             ("errors", ("additive", "invariant")),
-            ("order", ("most_uncertain", "consensus")),
             ("choose_among", ("predicted", "measured")),
             ("birth_order", ("lowest_id", "random")),
             ("skip_free_slots", (None, True, False)),
@@ -130,10 +126,10 @@ class FilterConfig(eqx.Module):
                 f"FilterConfig(update='stacked', smoothing={self.smoothing!r}): stacked corrections have no smooth "
                 "form; take update='sequential'."
             )
-        if self.update == "stacked" and (self.order, self.iterations) != ("most_uncertain", 1):
+        if self.update == "stacked" and self.iterations != 1:
             raise ValueError(
-                f"FilterConfig(update='stacked', order={self.order!r}, iterations={self.iterations}): corrections at "
-                "once have no order and are linearised once; take update='sequential'."
+                f"FilterConfig(update='stacked', iterations={self.iterations}): stacked corrections are linearised "
+                "once; take update='sequential'."
             )
         if self.max_updates > self.max_landmarks:
             raise ValueError(

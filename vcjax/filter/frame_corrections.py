@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.consensus import consensus_order
 from vcjax.filter.correction import Innovation, correct_stacked, correct_with, innovate, pixel_cov
 from vcjax.filter.features import measurement_model
 from vcjax.filter.submap import Submap, block, block_cov
@@ -137,13 +136,7 @@ def _correct_accepted(
         return submap, (innovation, margin)
 
     candidates = (jnp.arange(is_measured.shape[0]), uv_px, is_measured, margin)
-    if config.order == "consensus":
-        order = consensus_order(config, camera, submap, uv_px, is_measured)
-        candidates = jax.tree.map(lambda leaf: leaf[order], candidates)
     submap, (innovation, margin) = jax.lax.scan(correct_next, submap, candidates)
-    if config.order == "consensus":
-        back = jnp.argsort(order)
-        innovation, margin = jax.tree.map(lambda leaf: leaf[back], (innovation, margin))
     return submap, innovation, margin
 
 
