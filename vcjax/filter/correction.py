@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vcjax.ekf import mahalanobis, whiten, whitener
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.features import observe
+from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.reparametrisation import AtCorrection
 from vcjax.filter.state import VEHICLE
 from vcjax.filter.submap import (
@@ -66,7 +67,7 @@ def innovate(
     HP = H @ block_rows(submap.P, j) - HU @ submap.U
     S = block_columns(HP, j) @ H.T + pixel_cov(config, H.dtype)
     z = uv_px - observation.pixel
-    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible, H[:, VEHICLE:]), Gain(
+    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible, H[:, -SLOT:]), Gain(
         H, HP, HU
     )
 
