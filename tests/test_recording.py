@@ -66,6 +66,7 @@ def test_frame_is_a_row_of_every_field(recording):
         np.testing.assert_array_equal(getattr(frame, name), getattr(recording, name)[3])
     np.testing.assert_array_equal(frame.camera.intrinsics_px, recording.camera.intrinsics_px)
     assert recording.num_frames == T
+    assert frame.time_step_s == recording.time_s[3] - recording.time_s[2] and recording.frame(0).time_step_s == 0
 
 
 BAD_VALUES = {
