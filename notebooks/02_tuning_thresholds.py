@@ -44,17 +44,17 @@ import vcjax as vc
 from vcjax.report.comparison import comparison
 from vcjax.report.detection_curves import curves_figure
 from vcjax.report.landscape import landscape_figure
-from vcjax.study.choice import ALL, Seeds
-from vcjax.study.descent import Schedule, end_of
-from vcjax.study.evaluate import evaluate
-from vcjax.study.intervals import THRESHOLDS
-from vcjax.study.landscape import as_grid, search
-from vcjax.study.losses import Objective
 from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
-from vcjax.study.problem import problem_of
-from vcjax.study.scenes import Scenes
 from vcjax.study.sweep import Experiment, replace_at
-from vcjax.study.tune import tune
+from vcjax.tuning.choice import ALL, Seeds
+from vcjax.tuning.descent import Schedule, end_of
+from vcjax.tuning.evaluate import evaluate
+from vcjax.tuning.intervals import THRESHOLDS
+from vcjax.tuning.landscape import as_grid, search
+from vcjax.tuning.losses import Objective
+from vcjax.tuning.problem import problem_of
+from vcjax.tuning.scenes import Scenes
+from vcjax.tuning.tune import tune
 
 TH1, TH2 = "config.gate.th1", "config.gate.th2"
 
@@ -133,7 +133,7 @@ for temperature, loss in of_soft.items():
 # A single seed is rough, with soft decisions no less than with hard ones: which features are chosen, born and deleted
 # stays a hard decision, so one flip makes another run. The derivative of one run is true and yet of little use. What is
 # made small is therefore a mean, over scenes, over seeds that are new in every step, and over a neighbourhood of the
-# thresholds (see `vcjax/study/descent.py`), while τ falls from 1 to 0.25.
+# thresholds (see `vcjax/tuning/descent.py`), while τ falls from 1 to 0.25.
 
 # %%
 assert all(np.argmin(loss) == 3 for loss in (of_hard, *of_soft.values())) and round(coarse[3], 6) == 12

@@ -46,15 +46,15 @@ from vcjax.models.camera import project
 from vcjax.models.motion import Oscillation, oscillate
 from vcjax.report.comparison import comparison
 from vcjax.report.descent import descent_figure
-from vcjax.study.choice import ALL, Seeds
-from vcjax.study.descent import Schedule
-from vcjax.study.evaluate import evaluate
-from vcjax.study.intervals import OSCILLATION
-from vcjax.study.losses import Objective
 from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
-from vcjax.study.scenes import Scenes
 from vcjax.study.sweep import Experiment, replace_at
-from vcjax.study.tune import tune
+from vcjax.tuning.choice import ALL, Seeds
+from vcjax.tuning.descent import Schedule
+from vcjax.tuning.evaluate import evaluate
+from vcjax.tuning.intervals import OSCILLATION
+from vcjax.tuning.losses import Objective
+from vcjax.tuning.scenes import Scenes
+from vcjax.tuning.tune import tune
 
 A, F = "scenario.oscillation.amplitude_m", "scenario.oscillation.frequency_hz"
 

@@ -38,6 +38,12 @@ import numpy as np
 from IPython.display import Image, display
 
 import vcjax as vc
+from vcjax.recorded.filtered import filter_recording
+from vcjax.recorded.run_folder import landmark_map, robot_poses
+from vcjax.recorded.run_summary import run_summary, run_summary_text
+from vcjax.recorded.track_detection import track_detection, track_detection_text
+from vcjax.recorded.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
+from vcjax.recorded.verdicts import VERDICTS, track_verdicts, verdicts
 from vcjax.report.feature_pictures import FeaturePictures
 from vcjax.report.path_view import path_figure
 from vcjax.simulation.world import Movers
@@ -49,12 +55,6 @@ from vcjax.sources.overview import summary
 from vcjax.sources.recording_file import TrackLabel, load_recording, save_recording
 from vcjax.sources.rendered_sequence import render_sequence
 from vcjax.sources.tracks import tracks_of
-from vcjax.study.filtered import filter_recording
-from vcjax.study.run_folder import landmark_map, robot_poses
-from vcjax.study.run_summary import run_summary, run_summary_text
-from vcjax.study.track_detection import track_detection, track_detection_text
-from vcjax.study.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
-from vcjax.study.verdicts import VERDICTS, track_verdicts, verdicts
 
 # %% [markdown]
 # ## 1. Images

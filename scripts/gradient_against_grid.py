@@ -16,15 +16,15 @@ import tyro
 import vcjax as vc
 from vcjax.report.tuning import write_search, write_tuning
 from vcjax.storage import write_file
-from vcjax.study.choice import Seeds
-from vcjax.study.descent import Schedule
-from vcjax.study.evaluate import evaluate
-from vcjax.study.intervals import OSCILLATION, THRESHOLDS
-from vcjax.study.landscape import as_grid, search
-from vcjax.study.losses import WANTED
-from vcjax.study.scenes import Scenes
 from vcjax.study.summary import mean_and_error, student_t
-from vcjax.study.tune import tune
+from vcjax.tuning.choice import Seeds
+from vcjax.tuning.descent import Schedule
+from vcjax.tuning.evaluate import evaluate
+from vcjax.tuning.intervals import OSCILLATION, THRESHOLDS
+from vcjax.tuning.landscape import as_grid, search
+from vcjax.tuning.losses import WANTED
+from vcjax.tuning.scenes import Scenes
+from vcjax.tuning.tune import tune
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,12 +13,12 @@ import tyro
 
 import vcjax as vc
 from vcjax.report.tuning import write_tuning
-from vcjax.study.choice import Seeds
-from vcjax.study.descent import Schedule
-from vcjax.study.intervals import Interval
-from vcjax.study.losses import Objective
-from vcjax.study.scenes import Scenes
-from vcjax.study.tune import tune
+from vcjax.tuning.choice import Seeds
+from vcjax.tuning.descent import Schedule
+from vcjax.tuning.intervals import Interval
+from vcjax.tuning.losses import Objective
+from vcjax.tuning.scenes import Scenes
+from vcjax.tuning.tune import tune
 
 
 @dataclasses.dataclass(frozen=True)

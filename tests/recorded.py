@@ -10,10 +10,10 @@ from quick import QUICK
 from rendered import rendered, tracked
 
 import vcjax as vc
+from vcjax.recorded import filtered as module
+from vcjax.recorded.filtered import Filtered, filter_recording
 from vcjax.sources.recording_file import RecordingFile, load_recording, save_recording
 from vcjax.sources.tracks import recording_from_tracks
-from vcjax.study import filtered as module
-from vcjax.study.filtered import Filtered, filter_recording
 
 # The filter as it is, but compiled quickly.
 module._start = jax.jit(module._start.__wrapped__, compiler_options=QUICK)

@@ -43,8 +43,11 @@ ROOMS = {
             "devices",
         }
     ),
-    "report": below_study | {"study"},
-    "commands": below_study | {"study", "report"},
+    "tuning": (above_study := below_study | {"study"}),
+    "detectability": above_study | {"tuning"},
+    "recorded": above_study,
+    "report": (results := above_study | {"tuning", "detectability", "recorded"}),
+    "commands": results | {"report"},
     "cli": {"filter", "study", "commands"},
     "__main__": {"cli"},
 }

@@ -9,8 +9,8 @@ import xarray as xr
 from told import assert_one_line, said
 
 from vcjax.cli import main
-from vcjax.study import descent, evaluate
-from vcjax.study.scenes import Scenes
+from vcjax.tuning import descent, evaluate
+from vcjax.tuning.scenes import Scenes
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
 SCENES = ["--num-frames", "8", "--motions", "lateral", "--speeds-m-s", "1", "0.5", "--held-out-seeds", "3"]

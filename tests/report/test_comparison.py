@@ -10,10 +10,10 @@ from scipy import stats
 from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.landscape import PANELS, landscape_figure
 from vcjax.report.tuning import write_search, write_tuning
-from vcjax.study.choice import ALL, COMPARED, RECALL, Choice
-from vcjax.study.descent import Step
-from vcjax.study.landscape import as_grid
-from vcjax.study.tune import Tuned
+from vcjax.tuning.choice import ALL, COMPARED, RECALL, Choice
+from vcjax.tuning.descent import Step
+from vcjax.tuning.landscape import as_grid
+from vcjax.tuning.tune import Tuned
 
 TH1, TH2 = "config.gate.th1", "config.gate.th2"
 SCENES = ["lateral, 1 m/s", "inverse forward, 1 m/s"]

@@ -6,11 +6,11 @@ import PIL.Image
 import pytest
 import recorded
 
+from vcjax.recorded.verdicts import Verdicts, verdicts
 from vcjax.report.feature_pictures import _LEGEND_PX, STATUSES, FeaturePictures
 from vcjax.report.path_view import path_figure
 from vcjax.sources.map_file import CLASS_COLOURS, LandmarkMap
 from vcjax.sources.tracks import tracks_of
-from vcjax.study.verdicts import Verdicts, verdicts
 
 
 def passed() -> Verdicts:

@@ -7,16 +7,16 @@ import numpy as np
 from rich.console import Console
 
 from vcjax.commands.console import say
+from vcjax.detectability.best_oscillation import best_oscillation, require_price
+from vcjax.detectability.survey import predict_movers, require_power, survey
+from vcjax.detectability.velocity_test import VelocityTest
 from vcjax.devices import Cores
 from vcjax.report.detectability import Detectability as Found
 from vcjax.report.detectability import write_detectability
 from vcjax.simulation.scenarios import DynamicSet, RobotMotion, paper
 from vcjax.simulation.simulate import true_path
 from vcjax.storage import check_writable
-from vcjax.study.best_oscillation import best_oscillation, require_price
-from vcjax.study.detectability import VelocityTest
-from vcjax.study.scenes import Scenes
-from vcjax.study.survey import predict_movers, require_power, survey
+from vcjax.tuning.scenes import Scenes
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,13 +8,13 @@ import tyro
 from rich.console import Console
 
 from vcjax.commands.console import say
+from vcjax.recorded.run_folder import RunFolder, read_run
+from vcjax.recorded.track_detection import labels_of, track_detection, track_detection_text
+from vcjax.recorded.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, load_recording
 from vcjax.sources.trajectory_file import read_trajectory
 from vcjax.storage import check_writable, write_file
-from vcjax.study.run_folder import RunFolder, read_run
-from vcjax.study.track_detection import labels_of, track_detection, track_detection_text
-from vcjax.study.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,10 @@ from vcjax.commands.console import progress_bar, say
 from vcjax.commands.simulate import DetectorName, GateName
 from vcjax.devices import Cores
 from vcjax.filter.config import FilterConfig
+from vcjax.recorded import run_folder
+from vcjax.recorded.filtered import Filtered, filter_recording
+from vcjax.recorded.run_summary import run_summary, run_summary_text
+from vcjax.recorded.verdicts import Verdicts, track_verdicts, verdicts
 from vcjax.report.feature_pictures import FeaturePictures
 from vcjax.report.path_view import path_figure
 from vcjax.report.style import write_picture
@@ -19,11 +23,7 @@ from vcjax.sources.map_file import LandmarkMap
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, load_recording
 from vcjax.storage import check_writable
-from vcjax.study import run_folder
-from vcjax.study.filtered import Filtered, filter_recording
 from vcjax.study.results import describe
-from vcjax.study.run_summary import run_summary, run_summary_text
-from vcjax.study.verdicts import Verdicts, track_verdicts, verdicts
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,10 +11,10 @@ from vcjax.devices import Cores
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.report.tuning import write_search
-from vcjax.study.choice import Seeds
-from vcjax.study.landscape import search
-from vcjax.study.losses import WANTED, Objective
-from vcjax.study.scenes import Scenes
+from vcjax.tuning.choice import Seeds
+from vcjax.tuning.landscape import search
+from vcjax.tuning.losses import WANTED, Objective
+from vcjax.tuning.scenes import Scenes
 
 
 @dataclasses.dataclass(frozen=True)

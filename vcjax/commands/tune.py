@@ -12,13 +12,13 @@ from vcjax.devices import Cores
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.report.tuning import write_tuning
-from vcjax.study.choice import Seeds
-from vcjax.study.descent import Schedule
-from vcjax.study.intervals import OSCILLATION, THRESHOLDS
-from vcjax.study.landscape import around
-from vcjax.study.losses import WANTED, Objective
-from vcjax.study.scenes import Scenes
-from vcjax.study.tune import tune
+from vcjax.tuning.choice import Seeds
+from vcjax.tuning.descent import Schedule
+from vcjax.tuning.intervals import OSCILLATION, THRESHOLDS
+from vcjax.tuning.landscape import around
+from vcjax.tuning.losses import WANTED, Objective
+from vcjax.tuning.scenes import Scenes
+from vcjax.tuning.tune import tune
 
 What = Literal["thresholds", "oscillation", "joint"]
 

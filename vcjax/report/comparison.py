@@ -9,8 +9,8 @@ import xarray as xr
 
 from vcjax.report.markup import grid
 from vcjax.study import roc
-from vcjax.study.choice import COMPARED, FALSE_RATE, RECALL, Choice, by_scene, tracks_of
 from vcjax.study.summary import mean_and_error, student_t
+from vcjax.tuning.choice import COMPARED, FALSE_RATE, RECALL, Choice, by_scene, tracks_of
 
 _DECIMALS = dict.fromkeys((*COMPARED, RECALL), 2) | {
     "loss": 3,

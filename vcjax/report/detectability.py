@@ -12,11 +12,11 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MultipleLocator
 
+from vcjax.detectability.best_oscillation import Oscillating
+from vcjax.detectability.survey import SEARCHED_M_S, Prediction, Survey
 from vcjax.report.markup import grid, with_nulls
 from vcjax.report.style import RC, new_figure, write_figure
 from vcjax.storage import write_file
-from vcjax.study.best_oscillation import Oscillating
-from vcjax.study.survey import SEARCHED_M_S, Prediction, Survey
 
 _COLOURS = ("#4d4d4d", "#e69f00", "#009e73", "#0072b2", "#cc79a7", "#d55e00")
 _NEVER, _UNSEEN = "#bdbdbd", "white"

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from vcjax.report.style import RC, new_figure
 from vcjax.study import roc
-from vcjax.study.choice import ALL, FALSE_RATE, Choice, tracks_of
+from vcjax.tuning.choice import ALL, FALSE_RATE, Choice, tracks_of
 
 _STYLES = {
     "before": {"color": "#4d4d4d", "linestyle": (0, (5, 2))},

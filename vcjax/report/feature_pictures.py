@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from vcjax import extras
+from vcjax.recorded.verdicts import DYNAMIC, REJECTED, Verdicts
 from vcjax.sources.image_sequence import read_image
 from vcjax.sources.map_file import CLASS_COLOURS
 from vcjax.sources.recording_file import RecordingFile
 from vcjax.sources.tracks import tracks_of
 from vcjax.storage import write_file
-from vcjax.study.verdicts import DYNAMIC, REJECTED, Verdicts
 
 STATUSES = ("accepted", "recovered", "dynamic", "rejected", "not used")
 """What is told of a feature in a frame, the first four as in `verdicts.VERDICTS`; "not used": seen, and no more."""

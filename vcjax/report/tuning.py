@@ -14,10 +14,10 @@ from vcjax.report.landscape import landscape_figure
 from vcjax.report.markup import with_nulls
 from vcjax.report.style import write_figure
 from vcjax.storage import write_file
-from vcjax.study.choice import Choice
-from vcjax.study.landscape import as_grid
 from vcjax.study.results import save
-from vcjax.study.tune import Tuned
+from vcjax.tuning.choice import Choice
+from vcjax.tuning.landscape import as_grid
+from vcjax.tuning.tune import Tuned
 
 
 def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: Path) -> list[Path]:

@@ -1,1 +1,1 @@
-"""Many runs: Monte Carlo, figures of merit, and the paper's experiments."""
+"""Many runs: Monte Carlo, sweeps, figures of merit, the paper's experiments, results on disk."""

@@ -21,7 +21,6 @@ from vcjax.fields import require_key, require_kind
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.storage import remove_leftovers
-from vcjax.study.losses import Objective, camera_motion_m2_s2
 from vcjax.study.metrics import run_metrics
 from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
 from vcjax.study.results import (
@@ -36,6 +35,7 @@ from vcjax.study.results import (
     save,
 )
 from vcjax.study.sweep import Experiment, replace_at, require_paths
+from vcjax.tuning.losses import Objective, camera_motion_m2_s2
 
 Settings = Mapping[str, Sequence[float] | np.ndarray]
 """Path of a numeric leaf → its value in each setting; all of one length."""

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import recorded
 
+from vcjax.recorded.run_folder import camera_poses, new_run, read_run, robot_poses
+from vcjax.recorded.run_summary import run_summary
+from vcjax.recorded.verdicts import track_verdicts, verdicts
 from vcjax.sources.map_file import read_map
 from vcjax.sources.trajectory_file import read_kitti, read_tum
-from vcjax.study.run_folder import camera_poses, new_run, read_run, robot_poses
-from vcjax.study.run_summary import run_summary
-from vcjax.study.verdicts import track_verdicts, verdicts
 
 
 def write(folder, table="csv", **changes):

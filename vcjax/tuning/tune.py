@@ -19,12 +19,12 @@ from vcjax.fields import require_key
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.storage import write_file
-from vcjax.study.choice import Choice, Seeds, Setting, choose, setting_of
-from vcjax.study.descent import Schedule, Step, descend, end_of
-from vcjax.study.intervals import Interval
-from vcjax.study.losses import Objective
-from vcjax.study.problem import Problem, problem_of
 from vcjax.study.results import describe, import_xarray, provenance, refuse_other_settings
+from vcjax.tuning.choice import Choice, Seeds, Setting, choose, setting_of
+from vcjax.tuning.descent import Schedule, Step, descend, end_of
+from vcjax.tuning.intervals import Interval
+from vcjax.tuning.losses import Objective
+from vcjax.tuning.problem import Problem, problem_of
 
 _MARGIN = 0.1
 """How near to the ends of their intervals starts are drawn, as a part of these."""

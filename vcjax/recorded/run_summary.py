@@ -8,9 +8,9 @@ import numpy as np
 
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.info import FrameInfo
+from vcjax.recorded.filtered import Filtered
+from vcjax.recorded.verdicts import ACCEPTED, DELETED, DYNAMIC, RECOVERED, REJECTED, TrackVerdicts
 from vcjax.recording import Recording
-from vcjax.study.filtered import Filtered
-from vcjax.study.verdicts import ACCEPTED, DELETED, DYNAMIC, RECOVERED, REJECTED, TrackVerdicts
 
 
 def first_failure(info: FrameInfo) -> int | None:

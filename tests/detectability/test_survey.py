@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from vcjax.detectability.best_oscillation import best_oscillation, cost_and_gradient
+from vcjax.detectability.survey import heading, predict_movers, survey
+from vcjax.detectability.velocity_test import VelocityTest, mover_power, power
 from vcjax.simulation.scenarios import paper
-from vcjax.study.best_oscillation import best_oscillation, cost_and_gradient
-from vcjax.study.detectability import VelocityTest, mover_power, power
-from vcjax.study.evaluate import stacked
-from vcjax.study.intervals import Interval
-from vcjax.study.survey import heading, predict_movers, survey
 from vcjax.study.sweep import replace_at
+from vcjax.tuning.evaluate import stacked
+from vcjax.tuning.intervals import Interval
 
 NUM_FRAMES = 20
 SCENE = paper(num_frames=NUM_FRAMES)

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from reference import geometry
 from scipy import stats
 
+from vcjax.detectability.chi_squared import quantile
+from vcjax.detectability.velocity_test import VelocityTest, evidence, information, mover_power, power
 from vcjax.simulation.courses import Course
 from vcjax.simulation.scenarios import paper
-from vcjax.study.chi_squared import quantile
-from vcjax.study.detectability import VelocityTest, evidence, information, mover_power, power
 
 PLACE, VELOCITY = np.array([0.0, 1.0, 1.2]), np.array([0.024, 0.02, -0.016])
 BARE = VelocityTest(pose_noise=0.0, inverse_depth_std=np.inf)

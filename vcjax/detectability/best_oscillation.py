@@ -19,12 +19,12 @@ from jaxtyping import Array, Float
 from scipy.optimize import minimize
 from scipy.stats import qmc
 
+from vcjax.detectability.velocity_test import VelocityTest, mover_power, require_test
 from vcjax.simulation.scenarios import Scenario
-from vcjax.study.detectability import VelocityTest, mover_power, require_test
-from vcjax.study.evaluate import stacked
-from vcjax.study.intervals import OSCILLATION, Interval
-from vcjax.study.losses import camera_motion_m2_s2
 from vcjax.study.sweep import replace_at
+from vcjax.tuning.evaluate import stacked
+from vcjax.tuning.intervals import OSCILLATION, Interval
+from vcjax.tuning.losses import camera_motion_m2_s2
 
 _PATHS = tuple(path.removeprefix("scenario.") for path in OSCILLATION)
 

@@ -9,10 +9,10 @@ import tiny_runs
 import xarray as xr
 
 import vcjax as vc
-from vcjax.study import evaluate as module
-from vcjax.study.evaluate import evaluate
-from vcjax.study.losses import Objective
 from vcjax.study.summary import FIGURES, per_run
+from vcjax.tuning import evaluate as module
+from vcjax.tuning.evaluate import evaluate
+from vcjax.tuning.losses import Objective
 
 KEY = jax.random.key(5)
 SCENES = {f"{v} m/s": tiny_runs.scenario(dynamic_speed_m_s=v, num_frames=8) for v in (0.5, 1.0)}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vcjax.study.chi_squared import SMALL, noncentrality, quantile, survival
+from vcjax.detectability.chi_squared import SMALL, noncentrality, quantile, survival
 
 Q = np.array([1e-3, 0.5, 7.8, 16.3, 30.0, 80.0])
 DELTA = np.array([1e-9, 1e-3, SMALL * 0.999, SMALL * 1.001, 0.3, 4.0, 30.0, 200.0, 2000.0])

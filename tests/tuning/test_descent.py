@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from quick import QUICK
 
-from vcjax.study import descent as module
-from vcjax.study.descent import Schedule, descend, end_of
-from vcjax.study.intervals import OSCILLATION, THRESHOLDS, Interval
-from vcjax.study.losses import Objective
-from vcjax.study.problem import problem_of
+from vcjax.tuning import descent as module
+from vcjax.tuning.descent import Schedule, descend, end_of
+from vcjax.tuning.intervals import OSCILLATION, THRESHOLDS, Interval
+from vcjax.tuning.losses import Objective
+from vcjax.tuning.problem import problem_of
 
 KEY = jax.random.key(3)
 SCENES = {

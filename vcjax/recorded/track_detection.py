@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vcjax.recorded.verdicts import TrackVerdicts
 from vcjax.sources.recording_file import RecordingFile, TrackLabel, TrackLabels
 from vcjax.study import roc
-from vcjax.study.verdicts import TrackVerdicts
 
 _RESAMPLES_AT_ONCE = 50
 Interval = tuple[float, float, float]

@@ -10,10 +10,10 @@ import numpy as np
 from vcjax.fields import require_kind
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
-from vcjax.study.evaluate import stacked
-from vcjax.study.intervals import Interval
-from vcjax.study.losses import Objective
 from vcjax.study.sweep import Experiment, require_paths
+from vcjax.tuning.evaluate import stacked
+from vcjax.tuning.intervals import Interval
+from vcjax.tuning.losses import Objective
 
 MAX_AMPLITUDE_M = 0.5
 """How far a camera on a robot can be thought to swing to either side, m."""

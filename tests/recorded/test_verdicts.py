@@ -12,9 +12,9 @@ from scipy import integrate, stats
 
 import vcjax as vc
 from vcjax.filter.info import FrameInfo
-from vcjax.study.filtered import Filtered, LastPlaces
-from vcjax.study.run_summary import first_failure, nis_moments, run_summary, run_summary_text
-from vcjax.study.verdicts import VERDICTS, classes, track_verdicts, verdicts
+from vcjax.recorded.filtered import Filtered, LastPlaces
+from vcjax.recorded.run_summary import first_failure, nis_moments, run_summary, run_summary_text
+from vcjax.recorded.verdicts import VERDICTS, classes, track_verdicts, verdicts
 
 nan = math.nan
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from vcjax.filter.info import FrameInfo
 from vcjax.recording import Truth
 from vcjax.simulation.scenarios import paper
-from vcjax.study.losses import (
+from vcjax.tuning.losses import (
     Labelled,
     Objective,
     camera_motion_m2_s2,

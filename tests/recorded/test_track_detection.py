@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import vcjax as vc
+from vcjax.recorded.track_detection import labels_of, track_detection, track_detection_text
+from vcjax.recorded.verdicts import TrackVerdicts, track_verdicts, verdicts
 from vcjax.sources.recording_file import RecordingFile, TrackLabel, TrackLabels
 from vcjax.study import roc
-from vcjax.study.track_detection import labels_of, track_detection, track_detection_text
-from vcjax.study.verdicts import TrackVerdicts, track_verdicts, verdicts
 
 
 def judged(margin, called) -> TrackVerdicts:

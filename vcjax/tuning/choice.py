@@ -17,9 +17,9 @@ from vcjax.fields import require_count
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study import roc
-from vcjax.study.evaluate import evaluate
-from vcjax.study.losses import Objective
 from vcjax.study.sweep import Experiment, number_at, require_paths
+from vcjax.tuning.evaluate import evaluate
+from vcjax.tuning.losses import Objective
 
 Setting = dict[str, float]
 """Path of a numeric leaf → its value."""

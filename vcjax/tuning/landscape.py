@@ -10,11 +10,11 @@ from jaxtyping import PRNGKeyArray
 from vcjax.fields import require_key
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
-from vcjax.study.choice import Choice, Seeds, Setting, choose, setting_of
-from vcjax.study.evaluate import evaluate
-from vcjax.study.intervals import Interval
-from vcjax.study.losses import Objective
 from vcjax.study.results import import_xarray
+from vcjax.tuning.choice import Choice, Seeds, Setting, choose, setting_of
+from vcjax.tuning.evaluate import evaluate
+from vcjax.tuning.intervals import Interval
+from vcjax.tuning.losses import Objective
 
 
 def search(

@@ -34,10 +34,10 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from vcjax.fields import number, require, require_count, require_key
-from vcjax.study.evaluate import scene
 from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
-from vcjax.study.problem import Problem
 from vcjax.study.sweep import Experiment, replace_at
+from vcjax.tuning.evaluate import scene
+from vcjax.tuning.problem import Problem
 
 _MEMORY = (0.5, 0.9)
 """Decay rates of the optimiser's momentum and of its scale: there are a dozen steps and not thousands."""

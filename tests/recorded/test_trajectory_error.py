@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vcjax.study.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
+from vcjax.recorded.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
 
 
 def path(num=400) -> Trajectory:

@@ -41,6 +41,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from vcjax.detectability.chi_squared import quantile, survival
 from vcjax.ekf import whitener
 from vcjax.fields import number, require, require_kind, require_single
 from vcjax.models.camera import is_inside, pixel_jacobian, project
@@ -48,7 +49,6 @@ from vcjax.models.frames import compose, rotation_matrix, to_frame
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import true_path
 from vcjax.simulation.world import moved
-from vcjax.study.chi_squared import quantile, survival
 
 _RIDGE_M2 = 1e-9
 """Information about a place where there is none, 1/m²: it lies within some 30 km."""

@@ -23,13 +23,13 @@ import numpy as np
 from jaxtyping import Float
 
 from vcjax.filter.info import FrameInfo
+from vcjax.recorded.filtered import Filtered
+from vcjax.recorded.verdicts import VERDICTS, TrackVerdicts, Verdicts, classes
 from vcjax.recording import Recording
 from vcjax.sources.map_file import LandmarkMap, write_map
 from vcjax.sources.table_file import Kind, read_table, write_table
 from vcjax.sources.trajectory_file import read_tum, write_kitti, write_tum
 from vcjax.storage import filling, write_file
-from vcjax.study.filtered import Filtered
-from vcjax.study.verdicts import VERDICTS, TrackVerdicts, Verdicts, classes
 
 TableFormat = Literal["csv", "parquet"]
 TABLES, ENDINGS = ("landmarks", "verdicts", "tracks"), ("csv", "parquet")

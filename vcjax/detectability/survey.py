@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from vcjax.detectability.chi_squared import noncentrality, quantile, survival
+from vcjax.detectability.velocity_test import VelocityTest, information, mover_power, require_test
 from vcjax.simulation.scenarios import Scenario
-from vcjax.study.chi_squared import noncentrality, quantile, survival
-from vcjax.study.detectability import VelocityTest, information, mover_power, require_test
 from vcjax.study.sweep import replace_at
 
 SEARCHED_M_S = 0.01 * 2.0 ** (np.arange(19) / 2)

@@ -11,7 +11,7 @@ from tiny_runs import compilations
 
 import vcjax as vc
 from vcjax.filter.state import landmark_cov
-from vcjax.study.filtered import filter_recording
+from vcjax.recorded.filtered import filter_recording
 
 run_once = jax.jit(vc.run, compiler_options=QUICK)
 

@@ -8,15 +8,15 @@ import pytest
 import tiny_runs
 import xarray as xr
 
-from vcjax.study import choice as module
-from vcjax.study import descent
-from vcjax.study.choice import ALL, Choice, Seeds, by_scene, choose, setting_of, tracks_of
-from vcjax.study.descent import Schedule, end_of
-from vcjax.study.intervals import Interval
-from vcjax.study.landscape import around, as_grid, search
-from vcjax.study.losses import Objective
-from vcjax.study.problem import problem_of
-from vcjax.study.tune import tune
+from vcjax.tuning import choice as module
+from vcjax.tuning import descent
+from vcjax.tuning.choice import ALL, Choice, Seeds, by_scene, choose, setting_of, tracks_of
+from vcjax.tuning.descent import Schedule, end_of
+from vcjax.tuning.intervals import Interval
+from vcjax.tuning.landscape import around, as_grid, search
+from vcjax.tuning.losses import Objective
+from vcjax.tuning.problem import problem_of
+from vcjax.tuning.tune import tune
 
 KEY = jax.random.key(5)
 SCENES = {f"{v} m/s": tiny_runs.scenario(dynamic_speed_m_s=v, num_frames=8) for v in (0.5, 1.0)}

@@ -1,0 +1,1 @@
+"""Which movers can be told from static features, before anything is run."""

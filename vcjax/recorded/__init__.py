@@ -1,0 +1,1 @@
+"""One run of a real recording: what it found, as files, and what it is worth."""
