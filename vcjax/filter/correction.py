@@ -67,9 +67,7 @@ def innovate(
     HP = H @ block_rows(submap.P, j) - HU @ submap.U
     S = block_columns(HP, j) @ H.T + pixel_cov(config, H.dtype)
     z = uv_px - observation.pixel
-    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible, H[:, -SLOT:]), Gain(
-        H, HP, HU
-    )
+    return Innovation(observation.pixel, z, S, mahalanobis(z, S), observation.is_visible, H[:, -SLOT:]), Gain(H, HP, HU)
 
 
 def correct_with(
