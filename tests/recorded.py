@@ -10,14 +10,14 @@ from quick import QUICK
 from rendered import rendered, tracked
 
 import vcjax as vc
-from vcjax.recorded import filtered as module
+from vcjax.filter import stretches as module
 from vcjax.recorded.filtered import Filtered, filter_recording
 from vcjax.sources.recording_file import RecordingFile, load_recording, save_recording
 from vcjax.sources.tracks import recording_from_tracks
 
 # The filter as it is, but compiled quickly.
-module._start = jax.jit(module._start.__wrapped__, compiler_options=QUICK)
-module._advance = jax.jit(module._step, donate_argnums=1, compiler_options=QUICK)
+module._first = jax.jit(module._first.__wrapped__, compiler_options=QUICK)
+module._advance = jax.jit(module._advance.__wrapped__, compiler_options=QUICK)
 
 OPTIONS = ["--max-landmarks", "40", "--choose-among", "measured", "--births-per-frame", "2"]
 

@@ -1,4 +1,4 @@
-"""Recordings filtered frame by frame: the numbers of one scan, and the map that a scan forgets."""
+"""Recordings filtered in stretches: the numbers of one scan, and the map that a scan forgets."""
 
 import dataclasses
 
@@ -12,6 +12,7 @@ from tiny_runs import compilations
 import vcjax as vc
 from vcjax.filter.state import landmark_cov
 from vcjax.recorded.filtered import filter_recording
+from vcjax.recording import PER_FRAME
 
 run_once = jax.jit(vc.run, compiler_options=QUICK)
 
@@ -19,9 +20,11 @@ run_once = jax.jit(vc.run, compiler_options=QUICK)
 def test_infos_and_map_are_those_of_one_scan():
     recording, found = recorded.content().recording, recorded.run()
     state, info = run_once(recorded.config(), recording)
+    assert found.info.departed is None
     for field in dataclasses.fields(info):
-        one, other = (np.asarray(getattr(x, field.name)) for x in (found.info, info))
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-8, err_msg=field.name)
+        one, other = (jax.tree.leaves(getattr(x, field.name)) for x in (found.info, info))
+        for a, b in zip(one, other, strict=field.name != "departed"):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-8, err_msg=field.name)
     # Those that the map still holds, worked out anew: p₀ + m/ρ, and its covariance by differences.
     held = np.flatnonzero(np.asarray(state.track_id) >= 0)
     landmarks, cov = np.asarray(state.landmarks)[held], np.asarray(landmark_cov(state))[held]
@@ -39,7 +42,7 @@ def test_infos_and_map_are_those_of_one_scan():
 
 
 def test_landmarks_that_left_the_map_stay_known():
-    """By the frame that held them last: a run over the frames until then ends with the same place."""
+    """Near to where a run over the frames that held them has them: all that came after is the frame they left in."""
     recording, found = recorded.content().recording, recorded.run()
     ids = found.info.track_id
     born = np.unique(ids[ids >= 0])
@@ -47,13 +50,13 @@ def test_landmarks_that_left_the_map_stay_known():
     gone = [track for track in born.tolist() if track not in ids[-1]]
     last = {track: int(np.flatnonzero(np.any(ids == track, axis=1))[-1]) for track in gone}
     track = next(track for track in gone if 5 < last[track] < 20)
-    part = jax.tree.map(lambda x: x, recording)
-    names = [f.name for f in dataclasses.fields(part) if np.ndim(getattr(part, f.name)) and f.name != "camera"]
-    cut = {n: getattr(part, n)[: last[track] + 1] for n in names if len(getattr(part, n)) == recording.num_frames}
-    until = filter_recording(recorded.config(), dataclasses.replace(part, **cut | {"is_last": cut["is_last"]}))
+    cut = {name: getattr(recording, name)[: last[track] + 1] for name in PER_FRAME}
+    until = filter_recording(recorded.config(), dataclasses.replace(recording, **cut))
     index, end = (np.flatnonzero(x.landmarks.track_id == track)[0] for x in (found, until))
-    np.testing.assert_allclose(found.landmarks.place_m[index], until.landmarks.place_m[end], rtol=1e-9)
-    np.testing.assert_allclose(found.landmarks.cov[index], until.landmarks.cov[end], rtol=1e-6, atol=1e-12)
+    moved = found.landmarks.place_m[index] - until.landmarks.place_m[end]
+    before, after = until.landmarks.cov[end], found.landmarks.cov[index]
+    assert moved @ np.linalg.solve(before, moved) < 9  # a correction's worth
+    assert 0.2 * np.trace(before) < np.trace(after) < 2.0 * np.trace(before)
 
 
 def test_another_threshold_compiles_nothing_and_progress_ends_with_the_last_frame():

@@ -22,7 +22,7 @@ class Window(NamedTuple):
 
     re1: Float[Array, "*L W"]
     """Their RE₁, newest first; 0 where there were not so many yet."""
-    count: Float[Array, "*L"]
+    num: Float[Array, "*L"]
     """How many there ever were."""
 
 
@@ -50,7 +50,7 @@ class WindowedNIS(AbstractDetector):
         (re1,) = evidence.found(evidence.re1)
         newest_first = jnp.concatenate([re1[:, None], state.re1[evidence.slot, :-1]], axis=1)
         state = Window(
-            set_at_slots(evidence, state.re1, newest_first), add_at_slots(evidence, state.count, jnp.ones_like(re1))
+            set_at_slots(evidence, state.re1, newest_first), add_at_slots(evidence, state.num, jnp.ones_like(re1))
         )
         margin = jnp.sum(state.re1, axis=1) - self.limit
-        return state, jnp.where(state.count >= self.window, margin, np.nan)
+        return state, jnp.where(state.num >= self.window, margin, np.nan)

@@ -1,32 +1,28 @@
-"""A recording, filtered frame by frame: what every frame showed, and where each landmark was when it was last held.
+"""A recording, filtered: what every frame showed, and where each landmark was when it was last held.
 
-The state is stepped from frame to frame on the host, so that memory holds one state however long the recording is, and
-the landmarks that leave the map, retired or deleted, stay known by their last mean and covariance.
+The recording goes through the filter in stretches, so that the device holds a part of it only, and the landmarks that
+leave the map, retired or deleted, stay known by their last mean and covariance.
 """
 
-import dataclasses
 import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.info import FrameInfo
-from vcjax.filter.slam import start, step
-from vcjax.filter.state import FilterState, landmark_cov
-from vcjax.models.landmarks import to_point, to_point_jacobian
-from vcjax.recording import Frame, Recording, validate
-
-_FRAMES_AT_ONCE = 64
-"""How many frames' infos wait before they are fetched from the device."""
+from vcjax.filter.known_landmarks import KnownLandmarks
+from vcjax.filter.landmark_points import LandmarkPoints, landmark_points
+from vcjax.filter.stretches import run_in_stretches
+from vcjax.recording import PER_FRAME, Recording
 
 
 class LastPlaces(NamedTuple):
-    """Landmarks as points of the world, as they were at the end of the last frame that the map held them."""
+    """Landmarks as points of the world, as they were when they left the map or the recording ended."""
 
     track_id: Int[np.ndarray, " L"]
     """Identities, growing."""
@@ -40,9 +36,10 @@ class Filtered(NamedTuple):
     """What a filter made of a recording."""
 
     info: FrameInfo
-    """Of every frame, leading axis T, NumPy arrays."""
+    """Of every frame, leading axis T, NumPy arrays; without the landmarks that left the map, which are in
+    `landmarks`."""
     landmarks: LastPlaces
-    """Every landmark that the map ever held at the end of a frame."""
+    """Every landmark that was ever born; of one born again its last life."""
     compile_s: float
     """How long the first frame and the second took, which is how long they compiled, s."""
     run_s: float
@@ -50,7 +47,10 @@ class Filtered(NamedTuple):
 
 
 def filter_recording(
-    config: FilterConfig, recording: Recording, progress: Callable[[int, int], None] | None = None
+    config: FilterConfig,
+    recording: Recording,
+    progress: Callable[[int, int], None] | None = None,
+    known: KnownLandmarks | None = None,
 ) -> Filtered:
     """Filter a whole recording, however long.
 
@@ -58,6 +58,7 @@ def filter_recording(
         config: filter configuration; births go by id.
         recording: T frames.
         progress: called with (frames done, T), now and then.
+        known: landmarks that are in the map from the start.
 
     Returns: infos as `vcjax.run` gives them, the map, and the time that it took.
 
@@ -65,77 +66,57 @@ def filter_recording(
         ValueError: for a recording that no filter can run on, or a configuration that needs a key.
     """
     check_arguments("filter_recording", config, None)
-    validate(recording)
     if config.birth_order == "random":
         raise ValueError("filter_recording(birth_order='random'): births of recordings go by id; take 'lowest_id'.")
-    num_frames = recording.num_frames
+    stretches = run_in_stretches(config, recording, known=known)  # refuses what cannot be run
     begin = time.perf_counter()
-    # Once round to compile; what is compiled already is not compiled again.
-    state, shown = _start(config, recording)
-    if num_frames > 1:
-        state, shown = _advance(config, state, _frame(recording, 1))
-    jax.block_until_ready(shown)
+    for _ in run_in_stretches(config, _first_two(recording), known=known):
+        pass
     compiled = time.perf_counter()
 
-    last = _LastPlaces(recording)
-    state, shown = _start(config, recording)
-    waiting, infos = [shown], []
-    for t in range(1, num_frames + 1):
-        if len(waiting) == _FRAMES_AT_ONCE or t == num_frames:
-            fetched = jax.device_get(waiting)
-            for info, places, covs in fetched:
-                infos.append(info)
-                last.note(info.track_id, places, covs)
-            waiting = []
-            if progress is not None:
-                progress(len(infos), num_frames)
-        if t < num_frames:
-            state, shown = _advance(config, state, _frame(recording, t))
-            waiting.append(shown)
-    info = jax.tree.map(lambda *leaves: np.stack(leaves), *infos)
+    infos, last = [], _LastPlaces()
+    for stretch in stretches:
+        last.note(stretch.info.departed)
+        infos.append(eqx.tree_at(lambda info: info.departed, stretch.info, None))
+        if progress is not None:
+            progress(stretch.next_frame, recording.num_frames)
+        state = stretch.state
+    last.note(_points(state))  # there is at least one frame
+    info = jax.tree.map(lambda *leaves: np.concatenate(leaves), *infos)
     return Filtered(info, last.known(), compiled - begin, time.perf_counter() - compiled)
 
 
-def _frame(recording: Recording, t: int) -> Frame:
-    """Frame t, cut out on the host where the recording is there."""
-    names = [field.name for field in dataclasses.fields(Frame) if field.name != "camera"]
-    return Frame(camera=recording.camera, **{name: jnp.asarray(getattr(recording, name)[t]) for name in names})
+def _first_two(recording: Recording) -> Recording:
+    """The first frames of a recording: enough to compile all that the others need."""
 
+    def of_frames(recording):
+        return [getattr(recording, name) for name in PER_FRAME]
 
-def _shown(state: FilterState, info: FrameInfo) -> tuple[FrameInfo, Float[Array, "L 3"], Float[Array, "L 3 3"]]:
-    """What is kept of a frame: its info, and each slot's landmark as a point with its covariance, J P Jᵀ."""
-    J = jax.vmap(to_point_jacobian)(state.landmarks)
-    return info, jax.vmap(to_point)(state.landmarks), J @ landmark_cov(state) @ J.mT
+    return eqx.tree_at(of_frames, recording, [leaf[:2] for leaf in of_frames(recording)])
 
 
 @jax.jit
-def _start(config: FilterConfig, recording: Recording):
-    state, info = start(config, recording)
-    return state, _shown(state, info)
-
-
-def _step(config: FilterConfig, state: FilterState, frame: Frame):
-    state, info = step(config, state, frame)
-    return state, _shown(state, info)
-
-
-_advance = jax.jit(_step, donate_argnums=1)
+def _points(state) -> LandmarkPoints:
+    return landmark_points(state)
 
 
 class _LastPlaces:
-    """Collects the last places of landmarks, frame by frame."""
+    """Collects the last places of landmarks."""
 
-    def __init__(self, recording: Recording):
-        self.ids = np.unique(np.asarray(recording.track_id)[np.asarray(recording.is_valid)])
-        self.place_m, self.cov = np.full((len(self.ids), 3), np.nan), np.full((len(self.ids), 3, 3), np.nan)
+    def __init__(self):
+        self.places: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
-    def note(self, track_id: np.ndarray, place_m: np.ndarray, cov: np.ndarray) -> None:
-        """Note the landmarks that the slots hold at the end of a frame, those with numbers."""
-        is_known = (track_id >= 0) & np.isfinite(place_m).all(axis=1) & np.isfinite(cov).all(axis=(1, 2))
-        index = np.searchsorted(self.ids, track_id[is_known])
-        self.place_m[index], self.cov[index] = place_m[is_known], cov[is_known]
+    def note(self, points: LandmarkPoints) -> None:
+        """Note landmarks, later ones in place of earlier ones, those with numbers."""
+        track_id, place_m, cov = (np.asarray(leaf) for leaf in (points.track_id, points.place_m, points.cov))
+        is_known = (track_id >= 0) & np.isfinite(place_m).all(axis=-1) & np.isfinite(cov).all(axis=(-2, -1))
+        for track, place, spread in zip(track_id[is_known].tolist(), place_m[is_known], cov[is_known], strict=True):
+            self.places[track] = (place, spread)
 
     def known(self) -> LastPlaces:
         """Those that were ever noted."""
-        is_known = np.isfinite(self.place_m[:, 0])
-        return LastPlaces(self.ids[is_known], self.place_m[is_known], self.cov[is_known])
+        ids = sorted(self.places)
+        place_m = np.array([self.places[track][0] for track in ids]).reshape(-1, 3)
+        return LastPlaces(
+            np.array(ids, int), place_m, np.array([self.places[track][1] for track in ids]).reshape(-1, 3, 3)
+        )
