@@ -45,11 +45,11 @@ def test_detector_is_the_one_named_with_options_of_its_own(name, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     seen = []
     monkeypatch.setattr(
-        "vcjax.commands.run.monte_carlo", lambda _, config, **__: seen.append(config) or fake_runs(num_seeds=2)
+        "vcjax.commands.simulate.monte_carlo", lambda _, config, **__: seen.append(config) or fake_runs(num_seeds=2)
     )
     own = {"velocity_glr": ["--threshold", "20", "--innovations", "corrected"], "cusum": ["--drift", "3"]}
     named = [] if name is None else ["--detector", name]
-    assert main(["run", "--gate", "RE", *named, *own.get(name, [])]) == 0
+    assert main(["simulate", "--gate", "RE", *named, *own.get(name, [])]) == 0
     expected = {"velocity_glr": vc.VelocityGLR(threshold=20, innovations="corrected"), "cusum": vc.Cusum(3.0)}
     assert describe(seen[0].detector) == describe(expected.get(name, DETECTORS[name or "inlier_ratio"]()))
 
