@@ -34,4 +34,4 @@ def test_re1_is_the_least_that_state_and_pixel_have_to_come_up_for():
         config = FilterConfig(max_landmarks=11, max_updates=4, iterations=iterations)
         re1[iterations] = float(innovate(config, recording.camera, submap, 0, uv_px)[0].re1)
     np.testing.assert_allclose(re1[12], least, rtol=1e-5)
-    assert abs(re1[1] / least - 1) > 1e-3
+    assert abs(re1[1] / least - 1) > 1e-3, (re1, least)
