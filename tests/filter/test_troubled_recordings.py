@@ -1,4 +1,4 @@
-"""What real recordings do: nothing to see, lost frames, jumping clocks, a full map. A run goes on, and says so."""
+"""What real recordings do: nothing to see, lost frames, jumping clocks, tracks that lie. A run goes on, and says so."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def infos(config, recording):
     return [info for _, info in filtered(config, recording)]
 
 
-@pytest.mark.parametrize("motion", ["constant velocity"])
+@pytest.mark.parametrize("motion", MOTIONS)
 def test_frames_without_features(motion):
     recording = head(recorded(0, robot="curved"), 25)
     whole, holed = infos(config_of(motion), recording), infos(config_of(motion), without_features(recording, GONE))
@@ -44,9 +44,10 @@ def test_frames_without_features(motion):
     growing = [spread(holed[t]) for t in range(GONE[0] - 1, GONE[-1] + 1)]
     assert np.all(np.diff(growing) > 0)
     assert all(info.is_finite for info in holed) and not holed[GONE[-1] + 1].is_blind
-    assert spread(holed[GONE[-1]]) > 1.5 * spread(whole[GONE[-1]])
-    # Features are found again, and some correct the state: it knows its place better than before.
-    assert spread(holed[-1]) < spread(holed[GONE[-1]])
+    # Odometry good to millimetres grows by √6 · 5 mm along each axis; without it the gap costs far more.
+    assert spread(holed[GONE[-1]]) > (1.1 if motion == "odometry" else 1.5) * spread(whole[GONE[-1]])
+    if motion == "constant velocity":  # features are found again: it knows its place better than before
+        assert spread(holed[-1]) < spread(holed[GONE[-1]])
 
 
 def test_lost_frames_are_a_longer_step():
@@ -62,6 +63,23 @@ def test_lost_frames_are_a_longer_step():
     expected = np.linalg.norm(before[GONE[-1] + 1].vehicle[:2] - before[GONE[0] - 1].vehicle[:2])
     assert 0.5 * expected < step < 2 * expected
     assert after[first].carried_std[0] > after[first - 1].carried_std[0]
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_wrong_tracks_are_left_out_and_the_run_goes_on(motion):
+    """From one frame to the next every track follows another point, for good."""
+    recording = head(recorded(0, robot="curved"), 30)
+    track_id = np.array(recording.track_id)
+    ids = np.unique(track_id[recording.is_valid])
+    other = np.arange(track_id.max() + 2)
+    other[ids] = np.roll(ids, 7)
+    track_id[15:] = np.where(recording.is_valid[15:], other[track_id[15:]], track_id[15:])
+    wrong = dataclasses.replace(recording, track_id=track_id, is_last=last_sightings(track_id, recording.is_valid))
+    found = infos(config_of(motion), wrong)
+    assert all(info.is_finite for info in found)
+    shares = [info.is_accepted.sum() / max(info.is_measured.sum(), 1) for info in found]
+    # Left out at first; after three frames VC has deleted what lies, and others have been born in its place.
+    assert np.mean(shares[5:15]) > 0.9 and np.mean(shares[15:18]) < 0.5 and np.mean(shares[18:20]) > 0.9
 
 
 def test_a_full_map_says_how_many_wait():
