@@ -11,8 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vcjax.recording import AnyArray
-
 SLOT = 7
 """Error coordinates of a landmark slot."""
 SLOTS_PER_BLOCK = 12
@@ -47,7 +45,7 @@ def read_rows(P_mm: Float[Array, "M M"], slot: Int[Array, " K"]) -> tuple[Float[
     return P_mm, jnp.where(_is_current(P_mm, slot)[:, None], rows, columns)
 
 
-def slot_blocks(P_mm: Float[AnyArray, "M M"]) -> Float[Array, "L 7 7"]:
+def slot_blocks(P_mm: Float[Array, "M M"]) -> Float[Array, "L 7 7"]:
     """Covariance of each slot with itself, the diagonal blocks."""
     num_slots = P_mm.shape[0] // SLOT
     blocks = jnp.asarray(P_mm).reshape(num_slots, SLOT, num_slots, SLOT)

@@ -21,7 +21,7 @@ from vcjax.recording import Frame
 class AbstractMotion(eqx.Module):
     """How the robot moves between frames."""
 
-    gives_scale: eqx.AbstractClassVar[bool]
+    gives_scale: ClassVar[bool]
     """Whether lengths are known from it; where not, the map's scale is free unless known landmarks give it."""
 
     @abstractmethod

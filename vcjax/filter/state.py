@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from vcjax.filter.config import FilterConfig
 from vcjax.filter.map_covariance import SLOT, SLOTS_PER_BLOCK, slot_blocks, symmetric
 from vcjax.models.frames import unit
-from vcjax.recording import AnyArray, Recording
+from vcjax.recording import Recording
 
 VEHICLE = 14
 """Error coordinates of robot and sensor; the motion model may add some of its own behind them."""
@@ -63,9 +63,9 @@ class FilterState(eqx.Module):
     """Key of the random birth order; None where births go by id."""
 
     @property
-    def is_mapped(self) -> Bool[AnyArray, " L"]:
+    def is_mapped(self) -> Bool[Array, " L"]:
         """Which slots hold a landmark."""
-        return self.track_id != FREE
+        return jnp.asarray(self.track_id) != FREE
 
     @property
     def robot(self) -> Float[Array, "7"]:
@@ -125,7 +125,7 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
 def landmark_cov(state: FilterState) -> Float[Array, "L 7 7"]:
     """Covariance of each landmark's coordinates (the last four rows and columns are zero where Euclidean)."""
     T = state.to_coordinates
-    return T @ slot_blocks(state.P_mm) @ T.mT
+    return T @ slot_blocks(jnp.asarray(state.P_mm)) @ T.mT
 
 
 def full_cov(state: FilterState) -> Float[Array, "N N"]:
