@@ -42,8 +42,6 @@ class FilterConfig(eqx.Module):
     errors: Literal["additive", "invariant"] = eqx.field(static=True, default="additive")
     """What the covariance is of: differences, as in the paper; or errors that turn robot and map together, for long
     paths without a known heading (see `invariant`)."""
-    iterations: int = eqx.field(static=True, default=1)
-    """How often a sequential correction is linearised; 1: once, at the state before it, as the paper does."""
     choose_among: Literal["predicted", "measured"] = eqx.field(static=True, default="predicted")
     """Choose the most uncertain among those predicted visible (one then not measured has used up its place), or among
     those that also were measured."""
@@ -107,7 +105,7 @@ class FilterConfig(eqx.Module):
             require(self, name, lambda v: np.isfinite(v) & (v >= 0), "give a number of at least 0.")
         frames = "give a number of frames of at least 0, or infinity: for good."
         require(self, "blacklist_frames", lambda n: n >= 0, frames)
-        for name in ("max_landmarks", "max_updates", "iterations"):
+        for name in ("max_landmarks", "max_updates"):
             require_count(self, name, 1)
         for name in ("births_first_frame", "births_per_frame", "blacklist_capacity"):
             require_count(self, name, 0)
@@ -125,11 +123,6 @@ class FilterConfig(eqx.Module):
             raise ValueError(
                 f"FilterConfig(update='stacked', smoothing={self.smoothing!r}): stacked corrections have no smooth "
                 "form; take update='sequential'."
-            )
-        if self.update == "stacked" and self.iterations != 1:
-            raise ValueError(
-                f"FilterConfig(update='stacked', iterations={self.iterations}): stacked corrections are linearised "
-                "once; take update='sequential'."
             )
         if self.max_updates > self.max_landmarks:
             raise ValueError(

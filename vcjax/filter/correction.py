@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vcjax.ekf import mahalanobis, whiten, whitener
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.features import Block, move, observe
+from vcjax.filter.features import observe
 from vcjax.filter.map_covariance import SLOT
 from vcjax.filter.reparametrisation import AtCorrection
 from vcjax.filter.submap import (
@@ -61,44 +61,14 @@ class Gain(NamedTuple):
 def innovate(
     config: FilterConfig, camera: Camera, submap: Submap, j: int | Int[Array, ""], uv_px: Float[Array, "2"]
 ) -> tuple[Innovation, Gain]:
-    """Innovation of candidate j at the submap's present state. Equations (8), (9), (13).
-
-    With `iterations` above 1, of the iterated filter (Gauss–Newton): h is linearised anew where the correction so found
-    would lead to, x + s, and z = y - h(x + s) + H s takes the place of y - h(x). RE₁ is then the least that the state's
-    and the pixel's error have to come up for together, which does not blame the feature for the curvature of h.
-    """
-    present = block(submap, j)
-    innovation, gain = _innovate_at(config, camera, submap, j, uv_px, present, None)
-    for _ in range(config.iterations - 1):
-        W = whitener(innovation.S)
-        shift = whiten(W, block_columns(submap, gain.HP, j)).T @ whiten(W, innovation.z)
-        moved, gain = _innovate_at(config, camera, submap, j, uv_px, present, shift)
-        innovation = moved._replace(is_visible=innovation.is_visible)
-    return innovation, gain
-
-
-def _innovate_at(
-    config: FilterConfig,
-    camera: Camera,
-    submap: Submap,
-    j: int | Int[Array, ""],
-    uv_px: Float[Array, "2"],
-    present: Block,
-    shift: Float[Array, " block"] | None,
-) -> tuple[Innovation, Gain]:
-    """Innovation of candidate j with h linearised at its present block, or at that moved by a shift."""
-    if shift is None:
-        observation = observe(config, camera, present)
-        pixel = observation.pixel
-    else:
-        observation = observe(config, camera, move(present, shift))
-        pixel = observation.pixel - observation.H @ shift
+    """Innovation of candidate j at the submap's present state. Equations (8), (9), (13)."""
+    observation = observe(config, camera, block(submap, j))
     H = observation.H if config.errors == "additive" else observation.H @ block_carry(config, submap, j)
     HU = weighted(submap, H @ block_columns(submap, submap.U, j).T)
     HP = H @ block_rows(submap, submap.P, j) - HU @ submap.U
     S = block_columns(submap, HP, j) @ H.T + pixel_cov(config, H.dtype)
-    z = uv_px - pixel
-    return Innovation(pixel, z, S, mahalanobis(z, S), observation.is_visible, H[:, -SLOT:]), Gain(H, HP, HU)
+    z, is_visible = uv_px - observation.pixel, observation.is_visible
+    return Innovation(observation.pixel, z, S, mahalanobis(z, S), is_visible, H[:, -SLOT:]), Gain(H, HP, HU)
 
 
 def correct_with(
