@@ -11,9 +11,10 @@ from reference import geometry as geo
 from scipy.linalg import expm
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.features import Block, observe
+from vcjax.filter.features import Block, observe, predict_features
 from vcjax.filter.motion_model import BiasedOdometry, ConstantVelocity, Odometry
 from vcjax.filter.state import full_cov
+from vcjax.gates.reprojection import ReprojectionError
 
 CARRIED = np.array([0.3, -0.1, 0.2, 0.05, 0.2, -0.3])
 MOTIONS = {
@@ -85,11 +86,12 @@ def test_prediction_is_that_of_plain_numpy(name, dt):
 
 def test_a_correction_reaches_what_is_carried_and_no_pixel_shows_it():
     motion = MOTIONS["constant velocity"]
-    config = config_of(motion)
+    config = dataclasses.replace(config_of(motion), choose_among="measured", gate=ReprojectionError(th1=1e9))
     state, frame = some_state(motion)
     predicted = predict(config, state, frame)
     # One of the mapped features is seen, and no other.
-    is_seen = np.asarray(frame.is_valid) & np.isin(frame.track_id, np.asarray(state.track_id))
+    is_visible = np.asarray(predict_features(config, predicted, frame.camera).is_visible)
+    is_seen = np.asarray(frame.is_valid) & np.isin(frame.track_id, np.asarray(state.track_id)[is_visible])
     only = np.flatnonzero(is_seen)[0]
     frame = dataclasses.replace(frame, is_valid=jnp.arange(len(is_seen)) == only)
     after, info = jax.device_get(step(config, state, frame))
