@@ -41,6 +41,8 @@ class Study:
     """Descents."""
     steps: int = 8
     """Steps of each."""
+    learning_rate: float = 0.4
+    """How far the first of them goes; the fewer steps, the farther they have to go."""
     pairs: int = 3
     """Pairs of runs of each scene in a step."""
     choosing_seeds: int = 12
@@ -61,7 +63,7 @@ def main(study: Study) -> None:
     else:
         intervals = OSCILLATION
         axes = {path: np.linspace(i.low, i.high, study.points + 1)[1:] for path, i in intervals.items()}
-    schedule = Schedule(num_steps=study.steps, pairs_per_step=study.pairs)
+    schedule = Schedule(num_steps=study.steps, pairs_per_step=study.pairs, learning_rate=study.learning_rate)
     config = vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")
     tuned = tune(
         scenarios,
