@@ -55,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         say(
             console,
-            "vcjax: stopped; what `reproduce`, `detect`, `tune` and `sweep` have finished is on disk, and they go on there.",
+            "vcjax: stopped; what `reproduce`, `detect`, `tune` and `sweep` have finished is on disk, and they go on "
+            "there.",
         )
         return 130
     return 0

@@ -6,10 +6,11 @@ import pytest
 import xarray as xr
 from fake_runs import fake_runs
 
-from vcjax.study import detect as module
 from vcjax.study import reproduce
 from vcjax.study.detect import METHODS, Scene, detect, pooled, scores
 from vcjax.study.paper import Cell
+from vcjax.study.results import attributes
+from vcjax.study.sweep import Experiment
 
 NUM_SEEDS = 7
 MOVING = Cell(4, "forward", "lateral", 1.0, "VC", True)
@@ -108,12 +109,12 @@ def test_scenes_are_the_six_with_movers_and_the_three_without(tmp_path, monkeypa
     """Every method in each, steady and oscillating; method by method, with the seeds of a block at a time."""
     worked = []
 
-    def monte_carlo(scenario, config, *, first_seed, num_seeds, **_):
+    def monte_carlo(scenario, config, *, first_seed, num_seeds, key, **_):
         worked.append((scenario, config, first_seed, num_seeds))
-        return fake_runs(MOVING, num_seeds=num_seeds).assign_coords(seed=first_seed + np.arange(num_seeds))
+        runs = fake_runs(MOVING, num_seeds=num_seeds).assign_coords(seed=first_seed + np.arange(num_seeds))
+        return runs.assign_attrs(attributes(Experiment(scenario, config), key))
 
     monkeypatch.setattr(reproduce, "monte_carlo", monte_carlo)
-    monkeypatch.setattr(module, "refuse_other_settings", lambda *_: None)
     runs = detect(tmp_path, ["RE+velocity_glr", "VC"], num_seeds=26, key=jax.random.key(0))
     assert len(runs) == 2 * 3 * 9 and len(worked) == 2 * len(runs)
     assert [(first, num) for _, _, first, num in worked[:2]] == [(0, 25), (25, 1)]

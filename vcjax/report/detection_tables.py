@@ -116,7 +116,7 @@ def write_detection(runs: Runs, directory: Path) -> list[Path]:
 
 @matplotlib.rc_context(RC)
 def found_figure(tables: Mapping[str, Any]) -> Figure:
-    """Share of the movers found over their speed, a panel for each motion and amplitude; bars are ± a standard error."""
+    """Share of the movers found over their speed, a panel for each motion and amplitude; bars are ± standard errors."""
 
     def draw(axes: Axes, speeds: np.ndarray, cells: list[dict[str, Any]], style: dict[str, Any]) -> None:
         mean, error = (np.array([100 * cell["found_fraction"][part] for cell in cells]) for part in ("mean", "se"))

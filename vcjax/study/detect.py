@@ -10,7 +10,6 @@ from numbers import Integral
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 import xarray as xr
 from jaxtyping import PRNGKeyArray
@@ -46,12 +45,12 @@ _WIDE_TH1 = 12.0
 METHODS: Mapping[str, FilterConfig] = {
     "VC": FilterConfig(gate=VirtualCorrection()),
     "RE": FilterConfig(gate=ReprojectionError()),
-    "RE+velocity_glr": _with(ReprojectionError(_WIDE_TH1), VelocityGLR(threshold=20.0)),
+    "RE+velocity_glr": _with(ReprojectionError(th1=_WIDE_TH1), VelocityGLR(threshold=20.0)),
     "VC+velocity_glr": _with(VirtualCorrection(), VelocityGLR(threshold=20.0)),
-    "RE+velocity_likelihood_ratio": _with(ReprojectionError(_WIDE_TH1), VelocityLikelihoodRatio()),
-    "RE+windowed_nis": _with(ReprojectionError(_WIDE_TH1), WindowedNIS()),
-    "RE+cusum": _with(ReprojectionError(_WIDE_TH1), Cusum()),
-    "RE+immediate": _with(ReprojectionError(_WIDE_TH1), Immediate()),
+    "RE+velocity_likelihood_ratio": _with(ReprojectionError(th1=_WIDE_TH1), VelocityLikelihoodRatio()),
+    "RE+windowed_nis": _with(ReprojectionError(th1=_WIDE_TH1), WindowedNIS()),
+    "RE+cusum": _with(ReprojectionError(th1=_WIDE_TH1), Cusum()),
+    "RE+immediate": _with(ReprojectionError(th1=_WIDE_TH1), Immediate()),
 }
 """What is compared, by name: one setting each for all scenes. VC and RE are the paper's, with the deletion rule of its
 toolbox; the others have a wider gate, the detector's own threshold, and flag for good."""
