@@ -13,6 +13,7 @@ from rich.console import Console
 
 from vcjax.commands.bench import Bench
 from vcjax.commands.console import say
+from vcjax.commands.detect import Detect
 from vcjax.commands.detectability import Detectability
 from vcjax.commands.evaluate import Evaluate
 from vcjax.commands.inspect import Inspect
@@ -54,7 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         say(
             console,
-            "vcjax: stopped; what `reproduce`, `tune` and `sweep` have finished is on disk, and they go on there.",
+            "vcjax: stopped; what `reproduce`, `detect`, `tune` and `sweep` have finished is on disk, and they go on "
+            "there.",
         )
         return 130
     return 0
@@ -72,6 +74,7 @@ def _parse(arguments: list[str]) -> Any:
         | Annotated[Simulate, tyro.conf.subcommand("simulate", default=simulate)]
         | Annotated[Tune, tyro.conf.subcommand("tune")]
         | Annotated[Sweep, tyro.conf.subcommand("sweep")]
+        | Annotated[Detect, tyro.conf.subcommand("detect")]
         | Annotated[Detectability, tyro.conf.subcommand("detectability")]
         | Annotated[Track, tyro.conf.subcommand("track")]
         | Annotated[Record, tyro.conf.subcommand("record")]

@@ -101,7 +101,7 @@ def reproduce(
     with together():
         mine = _my_part(blocks, _missing(directory, blocks))
         for done, (cell, first, end) in enumerate(mine, start=1):
-            _run_block(directory / "runs" / cell.identifier, cell, first, end, key)
+            run_block(directory / "runs" / cell.identifier, cell_experiment(cell), first, end, key)
             if progress is not None:
                 progress(done, len(mine), cell)
     return load_results(directory, tables=tables, num_seeds=num_seeds)
@@ -118,9 +118,9 @@ def load_results(
     """
     results = {}
     for cell in cells(tables):
-        blocks = [load(path) for _, _, path in _blocks(Path(directory) / "runs" / cell.identifier)]
+        blocks = [load(path) for _, _, path in blocks_in(Path(directory) / "runs" / cell.identifier)]
         if blocks:
-            results[cell] = _join(blocks)
+            results[cell] = joined_blocks(blocks)
     if not results:
         raise FileNotFoundError(f"{directory}: no results of the paper's cells here; run `vcjax reproduce` first.")
     shared = set.intersection(*(set(runs.seed.values.tolist()) for runs in results.values()))
@@ -145,7 +145,7 @@ def _checked(num_seeds: int, tables: Collection[int], key: PRNGKeyArray) -> list
 def _prepare(directory: Path, key: PRNGKeyArray) -> None:
     """Refuse a directory of other settings or that cannot be written, and clear what killed processes left."""
     for cell in cells():
-        for _, _, path in _blocks(directory / "runs" / cell.identifier):
+        for _, _, path in blocks_in(directory / "runs" / cell.identifier):
             refuse_other_settings(path, load_attributes(path), attributes(cell_experiment(cell), key))
         remove_leftovers(directory / "runs" / cell.identifier, "seeds_*.nc")
     write_file(directory / "README.txt", _README.encode())  # also tells at once whether the place can be written
@@ -160,7 +160,7 @@ def _all_blocks(tables: Collection[int], num_seeds: int) -> list[Block]:
 
 def _missing(directory: Path, blocks: list[Block]) -> list[Block]:
     """Those of the blocks that a directory lacks."""
-    there = {cell: list(_blocks(directory / "runs" / cell.identifier)) for cell, _, _ in blocks}
+    there = {cell: list(blocks_in(directory / "runs" / cell.identifier)) for cell, _, _ in blocks}
     return [
         (cell, first, end)
         for cell, first, end in blocks
@@ -175,9 +175,8 @@ def _my_part(blocks: list[Block], missing: list[Block]) -> list[Block]:
     return [blocks[i] for i in parts[jax.process_index()]]
 
 
-def _run_block(folder: Path, cell: Cell, first: int, end: int, key: PRNGKeyArray) -> None:
+def run_block(folder: Path, experiment: Experiment, first: int, end: int, key: PRNGKeyArray) -> None:
     """Run one block of seeds on this process's devices; a shorter one of the same first seed is replaced."""
-    experiment = cell_experiment(cell)
     runs = monte_carlo(
         experiment.scenario,
         experiment.config,
@@ -187,19 +186,19 @@ def _run_block(folder: Path, cell: Cell, first: int, end: int, key: PRNGKeyArray
         devices=jax.local_devices(),
     )
     written = save(runs, folder / f"seeds_{first:05d}-{end - 1:05d}.nc")
-    for found_first, _, path in list(_blocks(folder)):
+    for found_first, _, path in list(blocks_in(folder)):
         if found_first == first and path != written:
             path.unlink()
 
 
-def _blocks(folder: Path) -> Iterator[tuple[int, int, Path]]:
+def blocks_in(folder: Path) -> Iterator[tuple[int, int, Path]]:
     """First seed, end and path of the blocks in a folder, in order."""
     for path in sorted(folder.glob("seeds_*.nc")):
         if match := _BLOCK_NAME.fullmatch(path.name):
             yield int(match[1]), int(match[2]) + 1, path
 
 
-def _join(blocks: list[Any]) -> Any:
+def joined_blocks(blocks: list[Any]) -> Any:
     """Blocks of one cell as one data set; what does not depend on the seed is taken from the first."""
     import xarray as xr
 

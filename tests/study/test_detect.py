@@ -1,0 +1,147 @@
+"""Scores of detection against plain Python, on invented runs; which scenes there are, and what is refused."""
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from fake_runs import fake_runs
+
+from vcjax.study import reproduce
+from vcjax.study.detect import METHODS, Scene, detect, pooled, scores
+from vcjax.study.paper import Cell
+from vcjax.study.results import attributes
+from vcjax.study.sweep import Experiment
+
+NUM_SEEDS = 7
+MOVING = Cell(4, "forward", "lateral", 1.0, "VC", True)
+
+
+def invented(seed: int = 0) -> xr.Dataset:
+    """Runs whose features were mapped, flagged and flagged again in every combination; one run has failed."""
+    rng = np.random.default_rng(seed)
+    runs = fake_runs(MOVING, num_seeds=NUM_SEEDS, num_frames=40)
+    shape = runs.frames_mapped.shape
+    mapped = rng.choice([0, 5, 19, 20, 40], size=shape)
+    first = np.where(mapped > 0, rng.integers(1, 10, size=shape), 0)
+    verdicts, deletions = (rng.integers(0, 2, size=shape) * (mapped > 0) for _ in range(2))
+    flagged = verdicts + deletions > 0
+    is_finite = np.ones(NUM_SEEDS, bool)
+    is_finite[2] = False
+    new = {
+        "frames_mapped": mapped,
+        "first_mapped": first,
+        "dynamic_deletions": verdicts,
+        "inconsistent_deletions": deletions,
+        "first_deleted": np.where(flagged, first + rng.integers(1, 30, size=shape), 0),
+    }
+    runs = runs.assign({name: (("seed", "feature"), values) for name, values in new.items()})
+    return runs.assign(is_finite=("seed", is_finite), position_error_m=runs.position_error_m * (1 + 0.1 * seed))
+
+
+def test_scores_equal_python_loops():
+    runs, static = invented(1), invented(2)
+    found, movers, false, mapped, delays = ([] for _ in range(5))
+    for s in range(NUM_SEEDS):
+        if s == 2:
+            continue
+        counts, run = dict.fromkeys(("found", "movers", "false", "mapped", "delay"), 0), runs.isel(seed=s)
+        for f in range(runs.sizes["feature"]):
+            one = run.isel(feature=f)
+            flagged = int(one.dynamic_deletions) > 0 or int(one.inconsistent_deletions) > 0
+            if bool(runs.is_moving[f]):
+                counts["movers"] += flagged or int(one.frames_mapped) >= 20
+                counts["found"] += flagged
+                counts["delay"] += (int(one.first_deleted) - int(one.first_mapped)) if flagged else 0
+            elif int(one.frames_mapped) > 0:
+                counts["mapped"] += 1
+                counts["false"] += flagged
+        for into, name in zip(
+            (found, movers, false, mapped, delays), ("found", "movers", "false", "mapped", "delay"), strict=True
+        ):
+            into.append(counts[name])
+    score = scores(runs, static)
+    assert 0 < sum(found) < sum(movers) < 6 * (NUM_SEEDS - 1) and 0 < sum(false) < sum(mapped)
+    assert (score["movers_found"], score["movers"]) == (sum(found), sum(movers))
+    assert (score["static_flagged"], score["static_mapped"]) == (sum(false), sum(mapped))
+    assert (score["runs"], score["runs_failed"]) == (NUM_SEEDS, 1)
+    assert score["found_fraction"]["mean"] == pytest.approx(sum(found) / sum(movers))
+    assert score["static_flagged_fraction"]["mean"] == pytest.approx(sum(false) / sum(mapped))
+    assert score["delay_frames"]["mean"] == pytest.approx(sum(delays) / sum(found))
+    good = np.arange(NUM_SEEDS) != 2
+    rmse, static_rmse = (100 * np.sqrt((r.position_error_m.values[good] ** 2).mean(1)) for r in (runs, static))
+    assert score["position_rmse_cm"]["mean"] == pytest.approx(rmse.mean())
+    assert score["position_rmse_cm"]["se"] == pytest.approx(rmse.std(ddof=1) / np.sqrt(NUM_SEEDS - 1))
+    assert score["position_ratio"]["mean"] == pytest.approx(rmse.mean() / static_rmse.mean())
+    anees = runs.nees_position.values[good].mean(1) / 2
+    assert score["anees_position"]["mean"] == pytest.approx(anees.mean())
+
+
+def test_the_error_of_a_pooled_share_is_its_spread_over_many_studies():
+    """And not that of independent features: those of a run share its luck."""
+    rng = np.random.default_rng(0)
+    whole = rng.integers(3, 7, size=(4000, 40))
+    part = rng.binomial(whole, rng.beta(4, 2, size=whole.shape))
+    found = [pooled(p, w) for p, w in zip(part, whole, strict=True)]
+    ratios, errors = (np.array([each[name] for each in found]) for name in ("mean", "se"))
+    np.testing.assert_allclose(np.mean(errors), np.std(ratios), rtol=0.05)
+    independent = np.sqrt(np.mean(ratios) * (1 - np.mean(ratios)) / np.mean(whole.sum(1)))
+    assert np.mean(errors) > 1.15 * independent
+
+
+def test_a_share_of_nothing_is_unknown():
+    assert np.isnan(list(pooled(np.zeros(3), np.zeros(3)).values())).all()
+    one = pooled(np.array([2]), np.array([4]))
+    assert one["mean"] == 0.5 and np.isnan(one["se"])
+    assert pooled(np.array([6, 6]), np.array([6, 6])) == {"mean": 1.0, "se": 0.0}
+
+
+def test_runs_of_a_static_scene_have_no_movers_to_find():
+    runs = invented()
+    runs = runs.assign(is_moving=xr.zeros_like(runs.is_moving))
+    score = scores(runs, runs)
+    assert (
+        score["movers"] == 0 and np.isnan(score["found_fraction"]["mean"]) and np.isnan(score["delay_frames"]["mean"])
+    )
+    assert score["position_ratio"] == {"mean": 1.0, "se": 0.0}
+
+
+def test_scenes_are_the_six_with_movers_and_the_three_without(tmp_path, monkeypatch):
+    """Every method in each, steady and oscillating; method by method, with the seeds of a block at a time."""
+    worked = []
+
+    def monte_carlo(scenario, config, *, first_seed, num_seeds, key, **_):
+        worked.append((scenario, config, first_seed, num_seeds))
+        runs = fake_runs(MOVING, num_seeds=num_seeds).assign_coords(seed=first_seed + np.arange(num_seeds))
+        return runs.assign_attrs(attributes(Experiment(scenario, config), key))
+
+    monkeypatch.setattr(reproduce, "monte_carlo", monte_carlo)
+    runs = detect(tmp_path, ["RE+velocity_glr", "VC"], num_seeds=26, key=jax.random.key(0))
+    assert len(runs) == 2 * 3 * 9 and len(worked) == 2 * len(runs)
+    assert [(first, num) for _, _, first, num in worked[:2]] == [(0, 25), (25, 1)]
+    assert all(found.seed.values.tolist() == list(range(26)) for found in runs.values())
+    assert [type(config.gate).__name__ for _, config, *_ in worked] == ["VirtualCorrection"] * 54 + [
+        "ReprojectionError"
+    ] * 54
+    moving = [s for s, *_ in worked[:54:2] if s.movers.speed_m_s > 0]
+    assert sorted((s.oscillation.amplitude_m, s.movers.direction[0], s.movers.speed_m_s) for s in moving) == sorted(
+        (a, x, v) for a in (0.0, 0.05, 0.1) for x in (0.0, -1.0) for v in (0.25, 0.5, 1.0)
+    )
+    still = {(s.oscillation.amplitude_m, *s.start) for s, *_ in worked[:54:2] if s.movers.speed_m_s == 0}
+    assert len(still) == 9
+    # More seeds: only what is new; fewer: nothing.
+    worked.clear()
+    detect(tmp_path, ["VC"], num_seeds=30, key=jax.random.key(0))
+    assert {(first, num) for _, _, first, num in worked} == {(25, 5)} and len(worked) == 27
+    worked.clear()
+    fewer = detect(tmp_path, ["VC"], num_seeds=2, key=jax.random.key(0))
+    assert not worked and all(found.sizes["seed"] == 2 for found in fewer.values())
+
+
+def test_a_scene_knows_its_static_one():
+    scene = Scene(0.05, "inverse_forward", 0.25)
+    assert scene.static == Scene(0.05) and scene.label == "inverse forward, 0.25 m/s"
+    assert len({Scene(a, m, v).identifier for a in (0.0, 0.05) for m in ("lateral", None) for v in (1.0, 0.25)}) == 8
+
+
+def test_every_method_but_those_of_the_paper_flags_for_good():
+    assert {name for name, config in METHODS.items() if config.blacklist_capacity == 0} == {"VC", "RE"}

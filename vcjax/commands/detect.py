@@ -1,0 +1,61 @@
+"""`vcjax detect`: what each detector finds of the movers, what it flags wrongly, and what movers cost."""
+
+import dataclasses
+from pathlib import Path
+
+from rich.console import Console
+
+from vcjax.commands.console import numbered_key, progress_bar, say
+from vcjax.devices import Cores
+from vcjax.report.detection_tables import write_detection
+from vcjax.simulation.scenarios import DynamicMotion, DynamicSet
+from vcjax.study.detect import METHODS, detect
+
+
+@dataclasses.dataclass(frozen=True)
+class Detect:
+    """Run detectors in the scenes with movers and without, steady and oscillating, and score what they find.
+
+    DIR holds every finished block of runs: what was stopped goes on there, and more seeds or methods extend fewer.
+    """
+
+    seeds: int = 25
+    """Runs of each method in each scene."""
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Which: the paper's VC and RE, and gates with a detector."""
+    amplitudes_m: tuple[float, ...] = (0.0, 0.05, 0.1)
+    """Amplitudes of the camera's oscillation, m; 0: steady."""
+    motions: tuple[DynamicMotion, ...] = ("lateral", "inverse_forward")
+    """How the movers move."""
+    speeds_m_s: tuple[float, ...] = (1.0, 0.5, 0.25)
+    """Their speeds, m/s."""
+    dynamic_set: DynamicSet = "ahead"
+    """Which features move: the six ahead of the robot, the six near its path, or a bus."""
+    num_frames: int = 160
+    """Frames in a run."""
+    key: int = 0
+    """Number of the base random key."""
+    out: Path = Path("results/detect")
+    """Directory of the results."""
+    devices: Cores = dataclasses.field(default_factory=Cores)
+    """Where the runs are done."""
+
+    def __call__(self, console: Console) -> None:
+        """Run, score, report."""
+        with progress_bar(console, "compiling, first block") as show:
+            runs = detect(
+                self.out,
+                self.methods,
+                amplitudes_m=self.amplitudes_m,
+                motions=self.motions,
+                speeds_m_s=self.speeds_m_s,
+                dynamic_set=self.dynamic_set,
+                num_frames=self.num_frames,
+                num_seeds=self.seeds,
+                key=numbered_key(self.key),
+                progress=show,
+            )
+        paths = write_detection(runs, self.out)
+        print((self.out / "detect.md").read_text())
+        for path in paths:
+            say(console, f"wrote {path}")

@@ -1,0 +1,220 @@
+"""What methods found in the scenes with movers, as files: JSON for programs, Markdown for people, figures."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vcjax.report.markup import grid, with_nulls
+from vcjax.report.style import RC, new_figure, write_figure
+from vcjax.storage import write_file
+from vcjax.study.detect import METHODS, MIN_FRAMES_MAPPED, Runs, scores
+from vcjax.study.results import describe
+from vcjax.study.summary import paired_difference
+
+DIFFERENCES = ("position_rmse_cm", "orientation_error_deg")
+"""Figures that are compared with the static scene's, seed by seed."""
+_COLOURS = ("#000000", "#e69f00", "#009e73", "#0072b2", "#d55e00", "#cc79a7", "#56b4e9", "#8c8c00")
+_MARKERS = "osD^vPX*"
+_HEADER = (
+    "scene",
+    "method",
+    "movers found, %",
+    "static flagged, %",
+    "delay, frames",
+    "position, cm",
+    "against the static scene, cm",
+    "ratio",
+    "ANEES",
+)
+_INTRODUCTION = f"""\
+*Movers found*: unique movers flagged of those in the map for at least {MIN_FRAMES_MAPPED} frames or flagged, features
+of all runs pooled, and how many; *static flagged*: static features ever flagged of those ever mapped; *delay*: frames
+from first birth to first deletion of the movers found; *position*: RMS error of a run; *against the static scene*: the
+difference of it from the same seeds without movers, with its 95 % interval, bold where that excludes zero; *ratio*: of
+the two errors; *ANEES*: of the position, 1 of a consistent filter. ± is a standard error over runs, which is 0 where
+all runs agree. The features that are flagged are those that gate or detector has ever deleted.
+"""
+
+
+def detection_tables(runs: Runs) -> dict[str, Any]:
+    """Scores of every method in every scene as plain values.
+
+    Args:
+        runs: what `study.detect` gives.
+
+    Returns: `cells` with movers and `static_cells` without, each with `detector`, `robot_motion`, `dynamic_motion`,
+        `dynamic_speed_m_s`, `amplitude_m` and the `study.detect.scores`. Those with movers have the static scene's
+        `static_scene_position_rmse_cm`, and `difference`: by figure of `DIFFERENCES` the `mean` of scene - static scene
+        of the same seeds, its 95 % interval `lower` to `upper` and `num_pairs`. Beside them `methods`, the
+        configuration of each, and `num_seeds`.
+    """
+    cells, static_cells = [], []
+    for (method, scene), found in runs.items():
+        static = runs[method, scene.static]
+        cell: dict[str, Any] = {
+            "detector": method,
+            "robot_motion": scene.robot,
+            "dynamic_motion": scene.dynamic_motion,
+            "dynamic_speed_m_s": scene.dynamic_speed_m_s,
+            "amplitude_m": scene.amplitude_m,
+            "label": scene.label,
+        }
+        if scene.dynamic_motion is None:
+            cell |= scores(found, found)
+            static_cells.append(cell)
+            continue
+        cell |= scores(found, static)
+        cell["static_scene_position_rmse_cm"] = scores(static, static)["position_rmse_cm"]
+        cell["difference"] = _difference(found, static)
+        cells.append(cell)
+    return {
+        "num_seeds": max(int(found.sizes["seed"]) for found in runs.values()),
+        "min_frames_mapped": MIN_FRAMES_MAPPED,
+        "methods": {name: describe(METHODS[name]) for name in dict.fromkeys(method for method, _ in runs)},
+        "cells": cells,
+        "static_cells": static_cells,
+    }
+
+
+def detection_markdown(tables: Mapping[str, Any]) -> str:
+    """The same as Markdown: a table for each amplitude, the methods of a scene below each other."""
+    every = [*tables["cells"], *tables["static_cells"]]
+    failed, full = (sum(cell[name] for cell in every) for name in ("runs_failed", "runs_map_full"))
+    num_runs = sum(cell["runs"] for cell in every)
+    counts = f"{tables['num_seeds']} runs of each method in each scene; of {num_runs} runs {failed} failed"
+    sections = ["# Movers found\n", f"{counts}, and in {full} the map was full.\n", _INTRODUCTION]
+    for amplitude in dict.fromkeys(cell["amplitude_m"] for cell in every):
+        sections.append(f"## {'Oscillating, A = ' + format(amplitude, 'g') + ' m' if amplitude else 'Steady camera'}\n")
+        cells = [cell for cell in every if cell["amplitude_m"] == amplitude]
+        scenes = dict.fromkeys(cell["label"] for cell in cells)
+        sections.append(grid(_HEADER, [_row(cell) for scene in scenes for cell in cells if cell["label"] == scene]))
+    return "\n".join(sections)
+
+
+def write_detection(runs: Runs, directory: Path) -> list[Path]:
+    """Write `detect.json`, `detect.md` and the figures into a directory.
+
+    Returns: the paths written.
+
+    Raises:
+        OSError: if the directory cannot be written to.
+    """
+    tables = detection_tables(runs)
+    text = json.dumps(with_nulls(tables), indent=1) + "\n"
+    paths = [write_file(directory / "detect.json", text.encode())]
+    paths.append(write_file(directory / "detect.md", detection_markdown(tables).encode()))
+    paths += write_figure(found_figure(tables), directory / "figures" / "movers_found")
+    return paths + write_figure(position_figure(tables), directory / "figures" / "position")
+
+
+@matplotlib.rc_context(RC)
+def found_figure(tables: Mapping[str, Any]) -> Figure:
+    """Share of the movers found over their speed, a panel for each motion and amplitude; bars are ± standard errors."""
+
+    def draw(axes: Axes, speeds: np.ndarray, cells: list[dict[str, Any]], style: dict[str, Any]) -> None:
+        mean, error = (np.array([100 * cell["found_fraction"][part] for cell in cells]) for part in ("mean", "se"))
+        axes.errorbar(speeds, mean, error, **style)
+        axes.set_ylim(-4, 104)
+
+    return _panels(tables, "movers found, %", draw)
+
+
+@matplotlib.rc_context(RC)
+def position_figure(tables: Mapping[str, Any]) -> Figure:
+    """What movers add to the position error, over their speed; bars are 95 % intervals, paired by seed."""
+
+    def draw(axes: Axes, speeds: np.ndarray, cells: list[dict[str, Any]], style: dict[str, Any]) -> None:
+        added = [cell["difference"]["position_rmse_cm"] for cell in cells]
+        mean = np.array([each["mean"] for each in added])
+        half_width = np.array([each["upper"] - each["mean"] for each in added])
+        axes.axhline(0, color="#4d4d4d", linewidth=0.8)
+        axes.errorbar(speeds, mean, half_width, **style)
+
+    return _panels(tables, "position error added, cm", draw)
+
+
+def _panels(tables: Mapping[str, Any], label: str, draw) -> Figure:
+    """A row of panels for each motion, a column for each amplitude, a line for each method."""
+    cells = tables["cells"]
+    motions, amplitudes, speeds, methods = (
+        list(dict.fromkeys(cell[name] for cell in cells))
+        for name in ("dynamic_motion", "amplitude_m", "dynamic_speed_m_s", "detector")
+    )
+    figure = new_figure(2.3 * len(amplitudes) + 1.2, 2.2 * len(motions) + 0.8)
+    panels = figure.subplots(len(motions), len(amplitudes), squeeze=False, sharex=True, sharey=True)
+    place = {speed: i for i, speed in enumerate(sorted(speeds))}
+    for row, motion in zip(panels, motions, strict=True):
+        for axes, amplitude in zip(row, amplitudes, strict=True):
+            for i, method in enumerate(methods):
+                chosen = [
+                    cell
+                    for cell in cells
+                    if (cell["dynamic_motion"], cell["amplitude_m"], cell["detector"]) == (motion, amplitude, method)
+                ]
+                style = {"color": _COLOURS[i], "marker": _MARKERS[i], "markersize": 4, "capsize": 2, "label": method}
+                # Side by side, so that equal values are seen.
+                beside = 0.07 * (i - (len(methods) - 1) / 2)
+                at = np.array([place[cell["dynamic_speed_m_s"]] + beside for cell in chosen])
+                draw(axes, at, chosen, style | {"linewidth": 1.2})
+            camera = f"A = {amplitude:g} m" if amplitude else "steady"
+            axes.set_title(f"{motion.replace('_', ' ')}, {camera}")
+            axes.set_xticks(range(len(place)), [f"{speed:g}" for speed in place])
+    for axes in panels[-1]:
+        axes.set_xlabel("speed, m/s")
+    for axes in panels[:, 0]:
+        axes.set_ylabel(label)
+    handles, names = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(names)))
+    figure.suptitle(f"{tables['num_seeds']} runs each", fontsize=10)
+    return figure
+
+
+def _difference(found: Any, static: Any) -> dict[str, Any]:
+    """Scene - static scene, paired by seed."""
+    difference = paired_difference(found, static)
+    return {
+        name: {part: float(difference[name].sel(statistic=part)) for part in ("mean", "lower", "upper")}
+        | {"num_pairs": int(difference.num_pairs)}
+        for name in DIFFERENCES
+    }
+
+
+def _row(cell: Mapping[str, Any]) -> list[str]:
+    found = _text(cell["found_fraction"], 1, 100)
+    if cell["movers"]:
+        found += f" ({cell['movers_found']} of {cell['movers']})"
+    difference = cell.get("difference", {}).get("position_rmse_cm")
+    return [
+        cell["label"],
+        cell["detector"],
+        found,
+        _text(cell["static_flagged_fraction"], 2, 100),
+        _text(cell["delay_frames"], 1),
+        _text(cell["position_rmse_cm"], 2),
+        "–" if difference is None else _interval(difference),
+        "–" if difference is None else _text(cell["position_ratio"], 2),
+        _text(cell["anees_position"], 2),
+    ]
+
+
+def _text(figure: Mapping[str, float], decimals: int, factor: float = 1.0) -> str:
+    """Mean ± standard error; without the error, or a dash, where they are not known."""
+    mean, error = factor * figure["mean"], factor * figure["se"]
+    if not math.isfinite(mean):
+        return "–"
+    return f"{mean:.{decimals}f}" + (f" ± {error:.{decimals}f}" if math.isfinite(error) else "")
+
+
+def _interval(difference: Mapping[str, float]) -> str:
+    mean, lower, upper = (difference[part] for part in ("mean", "lower", "upper"))
+    if not math.isfinite(lower):
+        return "–" if not math.isfinite(mean) else f"{mean:+.2f}".replace("-", "−")
+    text = f"{mean:+.2f} [{lower:+.2f}, {upper:+.2f}]".replace("-", "−")
+    return f"**{text}**" if lower > 0 or upper < 0 else text

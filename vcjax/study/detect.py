@@ -1,0 +1,247 @@
+"""Methods by what they find: filters with a gate and a detector, in the scenes with movers and without.
+
+A directory holds, for each method in each scene, blocks of seeds as `reproduce` keeps them:
+`runs/<method>/<scene>/seeds_00000-00024.nc`. What is there is not run again, so a run that was stopped goes on where it
+was, and more seeds, methods or scenes extend fewer. All see the same draws of noise, seed by seed.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from numbers import Integral
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from jaxtyping import PRNGKeyArray
+
+from vcjax.fields import require_key
+from vcjax.filter.config import FilterConfig
+from vcjax.gates.cusum import Cusum
+from vcjax.gates.gate import AbstractDetector, AbstractGate
+from vcjax.gates.immediate import Immediate
+from vcjax.gates.reprojection import ReprojectionError
+from vcjax.gates.velocity_glr import VelocityGLR
+from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio
+from vcjax.gates.virtual_correction import VirtualCorrection
+from vcjax.gates.windowed_nis import WindowedNIS
+from vcjax.simulation.scenarios import DynamicMotion, DynamicSet, RobotMotion, Scenario, paper
+from vcjax.storage import check_writable, remove_leftovers
+from vcjax.study.reproduce import SEEDS_PER_BLOCK, blocks_in, joined_blocks, run_block
+from vcjax.study.results import attributes, load, load_attributes, refuse_other_settings
+from vcjax.study.summary import mean_and_error, per_run
+from vcjax.study.sweep import Experiment
+
+MIN_FRAMES_MAPPED = 20
+"""A mover counts if it was in the map for so many frames, or was flagged."""
+
+
+def _with(gate: AbstractGate, detector: AbstractDetector) -> FilterConfig:
+    """A filter in which what is flagged never comes back, and what was made too distant stays in view of the test."""
+    return FilterConfig(gate=gate, detector=detector, blacklist_capacity=64, see_beyond_infinity=True)
+
+
+# A gate that leaves out less keeps the tests of innovations closer to their χ² (see `velocity_glr`).
+_WIDE_TH1 = 12.0
+METHODS: Mapping[str, FilterConfig] = {
+    "VC": FilterConfig(gate=VirtualCorrection()),
+    "RE": FilterConfig(gate=ReprojectionError()),
+    "RE+velocity_glr": _with(ReprojectionError(th1=_WIDE_TH1), VelocityGLR(threshold=20.0)),
+    "VC+velocity_glr": _with(VirtualCorrection(), VelocityGLR(threshold=20.0)),
+    "RE+velocity_likelihood_ratio": _with(ReprojectionError(th1=_WIDE_TH1), VelocityLikelihoodRatio()),
+    "RE+windowed_nis": _with(ReprojectionError(th1=_WIDE_TH1), WindowedNIS()),
+    "RE+cusum": _with(ReprojectionError(th1=_WIDE_TH1), Cusum()),
+    "RE+immediate": _with(ReprojectionError(th1=_WIDE_TH1), Immediate()),
+}
+"""What is compared, by name: one setting each for all scenes. VC and RE are the paper's, with the deletion rule of its
+toolbox; the others have a wider gate, the detector's own threshold, and flag for good."""
+
+
+class Scene(NamedTuple):
+    """Where a method is run: what moves, how fast, and how the camera swings."""
+
+    amplitude_m: float
+    """A of the oscillation, m; 0: steady."""
+    dynamic_motion: DynamicMotion | None = None
+    """None: nothing moves."""
+    dynamic_speed_m_s: float | None = None
+    robot: RobotMotion = "forward"
+
+    @property
+    def label(self) -> str:
+        """In words, without the amplitude: e.g. "inverse forward, 0.5 m/s"."""
+        if self.dynamic_motion is None:
+            return f"static, robot {self.robot}"
+        return f"{self.dynamic_motion.replace('_', ' ')}, {self.dynamic_speed_m_s:g} m/s"
+
+    @property
+    def identifier(self) -> str:
+        """As a file name."""
+        speed = "" if self.dynamic_speed_m_s is None else f"_{self.dynamic_speed_m_s!r}_m_s"
+        return f"A_{self.amplitude_m!r}_{self.robot}_{self.dynamic_motion or 'static'}{speed}"
+
+    @property
+    def static(self) -> "Scene":
+        """The same without movers."""
+        return Scene(self.amplitude_m, robot=self.robot)
+
+    def scenario(self, dynamic_set: DynamicSet, num_frames: int) -> Scenario:
+        """The scenario, as `scenarios.paper` makes and checks it."""
+        return paper(
+            robot=self.robot,
+            dynamic=self.dynamic_motion,
+            dynamic_speed_m_s=self.dynamic_speed_m_s or 0.0,
+            dynamic_set=dynamic_set,
+            oscillation_amplitude_m=self.amplitude_m,
+            num_frames=num_frames,
+        )
+
+
+Runs = dict[tuple[str, Scene], Any]
+"""Method and scene → its runs, an `xarray.Dataset` as from `monte_carlo`."""
+
+
+def detect(
+    directory: str | Path,
+    methods: Collection[str] = tuple(METHODS),
+    *,
+    amplitudes_m: Sequence[float] = (0.0, 0.05, 0.10),
+    motions: Sequence[DynamicMotion] = ("lateral", "inverse_forward"),
+    speeds_m_s: Sequence[float] = (1.0, 0.5, 0.25),
+    dynamic_set: DynamicSet = "ahead",
+    num_frames: int = 160,
+    num_seeds: int = 25,
+    key: PRNGKeyArray,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Runs:
+    """Run methods in the scenes with movers, and in the static ones of the robot's three motions.
+
+    Args:
+        directory: where runs are kept; made if needed. Blocks of seeds that are there are read, not run.
+        methods: names among `METHODS`.
+        amplitudes_m: of the camera's oscillation, m; 0 is the steady camera.
+        motions: how the movers move.
+        speeds_m_s: their speeds, m/s, positive.
+        dynamic_set: which features move.
+        num_frames: frames in a run.
+        num_seeds: runs of each method in each scene, at least 1.
+        key: base key.
+        progress: called with (blocks done, blocks in all, what was run) after each block that had to be run.
+
+    Returns: the runs over the seeds 0 … num_seeds - 1.
+
+    Raises:
+        ValueError: for arguments that make no sense, before anything compiles; or if the directory holds runs of other
+            settings.
+        OSError: if the directory cannot be written.
+    """
+    require_key("detect", key)
+    if not isinstance(num_seeds, Integral) or num_seeds < 1:
+        raise ValueError(f"detect(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
+    if isinstance(methods, str) or not methods or not set(methods) <= set(METHODS):
+        raise ValueError(f"detect(methods={methods!r}): give at least one of {', '.join(METHODS)}.")
+    scenes = _scenes(amplitudes_m, motions, speeds_m_s)
+    scenarios = {scene: scene.scenario(dynamic_set, num_frames) for scene in scenes}
+    # Method by method, since each compiles once.
+    experiments = {(name, scene): Experiment(scenarios[scene], METHODS[name]) for name in METHODS for scene in scenes}
+    experiments = {place: experiment for place, experiment in experiments.items() if place[0] in methods}
+    folders = {(name, scene): Path(directory, "runs", name, scene.identifier) for name, scene in experiments}
+    check_writable(Path(directory, "detect.json"))
+    missing = []
+    for place, folder in folders.items():
+        remove_leftovers(folder, "seeds_*.nc")
+        there = list(blocks_in(folder))
+        for _, _, path in there:
+            refuse_other_settings(path, load_attributes(path), attributes(experiments[place], key))
+        for first in range(0, num_seeds, SEEDS_PER_BLOCK):
+            end = min(first + SEEDS_PER_BLOCK, num_seeds)
+            if not any(found == first and found_end >= end for found, found_end, _ in there):
+                missing.append((place, first, end))
+    for done, (place, first, end) in enumerate(missing, start=1):
+        run_block(folders[place], experiments[place], first, end, key)
+        if progress is not None:
+            name, scene = place
+            progress(done, len(missing), f"{name}, {scene.label}, A = {scene.amplitude_m:g} m")
+    return {
+        place: joined_blocks([load(path) for _, _, path in blocks_in(folder)]).sel(seed=np.arange(num_seeds))
+        for place, folder in folders.items()
+    }
+
+
+def scores(runs: xr.Dataset, static: xr.Dataset) -> dict[str, Any]:
+    """What a method found in a scene, and what its movers cost against the same scene without them.
+
+    Shares and delays are of features pooled over the runs: with aᵢ and bᵢ the sums of run i, r = Σ aᵢ / Σ bᵢ with the
+    standard error √(n/(n − 1) Σ (aᵢ − r bᵢ)²) / Σ bᵢ, since the features of a run depend on each other.
+
+    Args:
+        runs: runs of the scene, dimensions (seed, frame, feature).
+        static: runs of the scene without movers, of the same seeds.
+
+    Returns: with `mean` and `se`: `found_fraction`, unique movers flagged of those in the map for at least
+        `MIN_FRAMES_MAPPED` frames or flagged; `static_flagged_fraction`, static features ever flagged of those ever
+        mapped; `delay_frames`, from first birth to first deletion of the movers found; `position_rmse_cm`,
+        `orientation_error_deg` and `anees_position` of a run; and `position_ratio`, position error against the static
+        scene's over the seeds finite in both. Counts: `movers`, `movers_found`, `static_mapped`, `static_flagged`,
+        `runs`, `runs_failed` and `runs_map_full`. Failed runs are left out. NaN where there is nothing to count.
+
+    References: Cochran 1977, *Sampling Techniques*, section 2.11, for the standard error of a ratio.
+    """
+    figures, static_figures = per_run(runs), per_run(static)
+    is_finite = runs.is_finite.values.astype(bool)
+    is_moving, frames = runs.is_moving.values, runs.frames_mapped.values[is_finite]
+    is_flagged = (runs.dynamic_deletions + runs.inconsistent_deletions).values[is_finite] > 0
+    is_mover, is_static = is_moving & (is_flagged | (frames >= MIN_FRAMES_MAPPED)), ~is_moving & (frames > 0)
+    is_found, is_false = is_mover & is_flagged, is_static & is_flagged
+    delay = np.where(is_found, (runs.first_deleted - runs.first_mapped).values[is_finite], 0)
+    found, movers = is_found.sum(axis=1), is_mover.sum(axis=1)
+    false, mapped = is_false.sum(axis=1), is_static.sum(axis=1)
+    both = (runs.is_finite & static.is_finite).values
+    rmse = [each.position_rmse_cm.values[both] for each in (figures, static_figures)]
+    return {
+        "found_fraction": pooled(found, movers),
+        "static_flagged_fraction": pooled(false, mapped),
+        "delay_frames": pooled(delay.sum(axis=1), found),
+        **{name: _mean(figures[name]) for name in ("position_rmse_cm", "orientation_error_deg", "anees_position")},
+        "position_ratio": pooled(*rmse),
+        "movers": int(movers.sum()),
+        "movers_found": int(found.sum()),
+        "static_mapped": int(mapped.sum()),
+        "static_flagged": int(false.sum()),
+        "runs": len(is_finite),
+        "runs_failed": int((~is_finite).sum()),
+        "runs_map_full": int((runs.map_full_frames > 0).sum()),
+    }
+
+
+def pooled(part: np.ndarray, whole: np.ndarray) -> dict[str, float]:
+    """Σ part / Σ whole over runs with its standard error (see `scores`); NaN where there is no whole, or one run."""
+    num, total = len(whole), float(np.sum(whole))
+    if total == 0:
+        return {"mean": np.nan, "se": np.nan}
+    ratio = float(np.sum(part)) / total
+    square = float(np.sum((part - ratio * whole) ** 2))
+    return {"mean": ratio, "se": np.sqrt(num / (num - 1) * square) / total if num > 1 else np.nan}
+
+
+def _scenes(amplitudes_m, motions, speeds_m_s) -> list[Scene]:
+    """All scenes, amplitude by amplitude, static ones last."""
+    for name, values in (("amplitudes_m", amplitudes_m), ("motions", motions), ("speeds_m_s", speeds_m_s)):
+        if not values or len(set(values)) < len(values):
+            raise ValueError(f"detect({name}={tuple(values)}): give at least one, each once.")
+    if not all(np.isfinite(v) and v > 0 for v in speeds_m_s):
+        raise ValueError(f"detect(speeds_m_s={tuple(speeds_m_s)}): give positive speeds; the static scenes come along.")
+    robots: tuple[RobotMotion, ...] = ("forward", "curved", "lateral")
+    return [
+        scene
+        for a in map(float, amplitudes_m)
+        for scene in (
+            *(Scene(a, motion, float(v)) for motion in motions for v in speeds_m_s),
+            *(Scene(a, robot=robot) for robot in robots),
+        )
+    ]
+
+
+def _mean(values: xr.DataArray) -> dict[str, float]:
+    """Mean and standard error over the runs that have it."""
+    mean, error = mean_and_error(values, values.notnull())
+    return {"mean": float(mean), "se": float(error)}
