@@ -69,4 +69,4 @@ def _scan_in_stretches(advance, state, num_frames: int):
 
     frames = jnp.arange(1, 1 + num * length).reshape(num, length)
     state, infos = jax.lax.scan(jax.checkpoint(stretch), state, frames)
-    return state, jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:])[: num_frames - 1], infos)
+    return state, jax.tree.map(lambda a: a.reshape(num * length, *a.shape[2:])[: num_frames - 1], infos)

@@ -183,10 +183,10 @@ def scatter(
     landmarks = state.landmarks + jnp.sum(state.to_coordinates * shift[:, None], axis=-1)
     slots = Slots(landmark_means(submap), submap.to_coordinates, submap.is_euclidean)
     slots = settle(config, slots, submap.at_correction, submap.is_corrected)
-    U_v = submap.U[:, :v].T
-    UD_v, V = weighted(submap, U_v), weighted(submap, U.T).T
+    U_v, V = submap.U[:, :v].T, weighted(submap, U.T).T
     vehicle, N = normalise(config, vehicle_mean(submap))
     if config.errors == "invariant":
+        UD_v = weighted(submap, U_v)
         P_vv, P_vm = state.P_vv - UD_v @ U_v.T, state.P_vm - UD_v @ U
         A_m = turn_of_landmark(landmarks - state.landmarks).at[slot].set(turn_of_chosen(submap, slots))
         A = turn_of_vehicle(config.motion, submap.shift[:v]), A_m.reshape(-1, 3)
@@ -197,7 +197,8 @@ def scatter(
         P_vm = N @ (P_vm + A[0] @ B[1].T + B[0] @ A[1].T)
         V, U = jnp.concatenate([V, A[1].T, B[1].T]), jnp.concatenate([U, -B[1].T, -A[1].T])
     else:
-        NU_v, NUD_v = N @ U_v, N @ UD_v
+        NU_v = N @ U_v
+        NUD_v = weighted(submap, NU_v)
         P_vv, P_vm = N @ state.P_vv @ N.T - NUD_v @ NU_v.T, N @ state.P_vm - NUD_v @ U
     return eqx.tree_at(
         lambda s: (s.vehicle, s.landmarks, s.to_coordinates, s.is_euclidean, s.P_vv, s.P_vm, s.P_mm),
