@@ -63,7 +63,7 @@ def test_a_feature_has_the_largest_margin_of_the_detector(run_and_truth):
             largest[int(feature)] = max(largest.get(int(feature), -np.inf), margin)
     expected = np.array([largest.get(f, np.nan) for f in range(len(truth.is_moving))])
     np.testing.assert_array_equal(found["detector_margin"], expected)
-    assert len(largest) > 10
+    assert len(largest) > 2
     np.testing.assert_allclose(found["detector_auc"], area_under_roc(jnp.asarray(expected), truth.is_moving))
     held = np.asarray(run_and_truth[0].watched_id)[1:] >= 0
     np.testing.assert_array_equal(np.isnan(np.asarray(run_and_truth[0].detector_margin)[1:][~held]), True)

@@ -74,14 +74,14 @@ def filter_recording(
         pass
     compiled = time.perf_counter()
 
-    infos, last = [], _LastPlaces()
+    infos, last, state = [], _LastPlaces(), None
     for stretch in stretches:
         last.note(stretch.info.departed)
         infos.append(eqx.tree_at(lambda info: info.departed, stretch.info, None))
         if progress is not None:
             progress(stretch.next_frame, recording.num_frames)
         state = stretch.state
-    last.note(_points(state))  # there is at least one frame
+    last.note(_points(state))
     info = jax.tree.map(lambda *leaves: np.concatenate(leaves), *infos)
     return Filtered(info, last.known(), compiled - begin, time.perf_counter() - compiled)
 
