@@ -8,6 +8,7 @@ import tiny_runs
 from told import assert_one_line, said
 
 from vcjax.cli import main
+from vcjax.simulation import scenarios
 from vcjax.study import detect as module
 from vcjax.study import reproduce
 
@@ -20,6 +21,9 @@ TINY += ["--methods", "VC", "RE"]
 def small_maps(monkeypatch):
     small = {name: dataclasses.replace(config, **tiny_runs.CAPACITIES) for name, config in module.METHODS.items()}
     monkeypatch.setattr(module, "METHODS", small)
+    # In so few frames only what is near the start is mapped.
+    near = tiny_runs.scenario().landmarks_m[tiny_runs.MOVERS]
+    monkeypatch.setitem(scenarios.DYNAMIC_PLACES_M, "ahead", near.tolist())
 
 
 def test_detect_writes_its_scores_and_goes_on_where_it_stopped(tmp_path, capsys, monkeypatch):
