@@ -100,7 +100,7 @@ def main(study: Study) -> None:
         key=jax.random.key(3),
         directory=directory / "held_out",
     )
-    loss = runs.loss.mean("scene")
+    loss = runs.loss.mean("scene", skipna=False)
     difference = loss.sel(setting=1) - loss.sel(setting=2)
     mean, error = mean_and_error(difference, difference.notnull())
     half_width = float(error) * float(student_t(study.held_out_seeds))

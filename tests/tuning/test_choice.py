@@ -79,7 +79,7 @@ def test_the_landscape_around_a_setting_keeps_the_other_numbers(found):
 def test_runs_that_all_fail_are_refused(found, monkeypatch):
     failed = found.candidates.assign(loss=found.candidates.loss * np.nan)
     monkeypatch.setattr(module, "evaluate", lambda *_, **__: failed)
-    with pytest.raises(ValueError, match="no run of any candidate stayed finite"):
+    with pytest.raises(ValueError, match="every candidate has runs that did not stay finite"):
         choose(SCENES, SOFT, [found.before], objective=OBJECTIVE, seeds=SEEDS, key=KEY)
 
 

@@ -93,7 +93,7 @@ def choose(
         progress: called with what is done, and how many settings of how many.
 
     Raises:
-        ValueError: as `evaluate`, or if no candidate has a finite run.
+        ValueError: as `evaluate`, or if every candidate has a run that is not finite.
     """
     choosing_key, held_out_key = jax.random.split(key)
 
@@ -114,9 +114,10 @@ def choose(
         )
 
     runs = judge("candidates", candidates, seeds.choosing, choosing_key)
-    loss = runs.loss.mean(("scene", "seed")).values
+    # A candidate with a run that failed is not chosen: the others' mean would flatter it.
+    loss = runs.loss.mean(("scene", "seed"), skipna=False).values
     if np.all(np.isnan(loss)):
-        raise ValueError("no run of any candidate stayed finite; start elsewhere.")
+        raise ValueError("every candidate has runs that did not stay finite; start elsewhere.")
     after = candidates[int(np.nanargmin(loss))]
     return Choice(candidates[0], after, runs, judge("held out", [candidates[0], after], seeds.held_out, held_out_key))
 

@@ -152,8 +152,8 @@ def end_of(problem: Problem, history: Sequence[Step]) -> dict[str, float]:
 
 
 def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any, step: Step) -> tuple[np.ndarray, Any]:
-    """One step of the optimiser; none where no run was finite."""
-    if not np.isfinite(step.loss):
+    """One step of the optimiser; none where loss or gradient is not finite."""
+    if not np.all(np.isfinite([step.loss, *step.gradient.values()])):
         return free, state
     update, state = optimiser.update(jnp.asarray(list(step.gradient.values())), state, jnp.asarray(free))
     return free + np.asarray(update), state

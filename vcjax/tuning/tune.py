@@ -42,8 +42,9 @@ class Tuned(NamedTuple):
 
     @property
     def num_skipped(self) -> int:
-        """Steps not taken because no run of theirs stayed finite."""
-        return sum(not np.isfinite(step.loss) for steps in self.descents for step in steps)
+        """Steps not taken because their loss or gradient was not finite."""
+        steps = (step for steps in self.descents for step in steps)
+        return sum(not np.all(np.isfinite([step.loss, *step.gradient.values()])) for step in steps)
 
     @property
     def num_failed(self) -> int:
