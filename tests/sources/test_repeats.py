@@ -54,12 +54,16 @@ def test_a_recording_is_cut_in_place():
         if len(before := np.flatnonzero(recording.is_valid[9] & (ids[9] == ids[10, c]))):
             uv_px[10, c] = uv_px[9, before[0]]
     cut = cut_recording(dataclasses.replace(recording, uv_px=uv_px))
-    assert validate(cut.recording) is None and len(cut.origin) > 20
+    assert validate(cut.recording) is None and cut.num_cuts > 20
     np.testing.assert_array_equal(cut.track_of(cut.recording.track_id)[frame, column], ids[frame, column])
-    is_new = cut.recording.track_id > cut.last_id
-    assert not is_new[:10].any() and is_new[10].sum() == len(cut.origin)
+    # Numbered by when they begin, the pieces of old tracks before tracks that are new there.
+    pieces, first = np.unique(cut.recording.track_id[frame, column], return_index=True)
+    assert pieces.tolist() == list(range(len(cut.origin))) and np.all(np.diff(frame[first]) >= 0)
+    begun = cut.origin[frame[first] == 10]
+    assert np.all(np.diff(begun) > 0) and (begun <= ids[:10].max()).sum() == cut.num_cuts
     going_on = np.isin(ids[9], ids[10][recording.is_valid[10]]) & recording.is_valid[9]
     assert cut.recording.is_last[9][going_on].all() and cut.track_of(np.array(-1)) == -1
     same = cut_recording(recording)
-    assert len(same.origin) == 0 and same.track_of(np.array([3, -1])).tolist() == [3, -1]
+    assert same.num_cuts == 0
+    np.testing.assert_array_equal(same.track_of(same.recording.track_id)[frame, column], ids[frame, column])
     np.testing.assert_array_equal(same.recording.is_last, recording.is_last)

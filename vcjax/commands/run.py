@@ -111,7 +111,7 @@ class Run:
             scale = {"scale": f"known from {distance.distance_m:g} m between tracks {tracks}", "scale_factor": factor}
         passed = verdicts(filtered.info)
         tracks = track_verdicts(passed, filtered.info)
-        cuts = {"tracks_cut": None if cut is None else len(cut.origin)}
+        cuts = {"tracks_cut": None if cut is None else cut.num_cuts}
         summary: dict[str, Any] = run_summary(self.config, content.recording, filtered, tracks) | scale | cuts
         print(run_summary_text(summary), flush=True)
         provenance = {"recording": str(self.recording.absolute()), "config": describe(self.config)}

@@ -32,8 +32,8 @@ def scale_source(motion: AbstractMotion, recording: Recording, known: KnownLandm
     """What gives a run its lengths, in words; None where nothing does, and the scale is free."""
     if motion.gives_scale and np.any(np.asarray(recording.odometry)):
         return "odometry"
-    if known is not None and len(known.track_id) > 1:
-        return f"{len(known.track_id)} known landmarks"
+    if known is not None and (num := len(known.track_id)):  # one will do: the start's place is known as well
+        return f"{num} known landmark{'s' if num > 1 else ''}"
     if np.any(np.asarray(recording.sensor_shift_m)):
         return "the commanded motion of the camera"
     return None

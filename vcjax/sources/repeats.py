@@ -24,18 +24,18 @@ class CutRecording(NamedTuple):
     """A recording whose tracks are cut where they repeat."""
 
     recording: Recording
-    last_id: int
-    """The largest identity before; pieces cut off are numbered from there on."""
+    """Its tracks are the pieces, numbered by the frame in which they begin, and of those that begin together the one
+    of the oldest track first: births by id take what has been followed for long before what is new."""
     origin: Int[np.ndarray, " C"]
-    """Track that each piece was cut off."""
+    """Track that each piece is of."""
+    num_cuts: int
 
     def track_of(self, piece: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
         """Which track each piece belongs to; -1, nobody, stays."""
         piece = np.asarray(piece)
         if not len(self.origin):
             return piece
-        cut = self.origin[(piece - self.last_id - 1).clip(0, len(self.origin) - 1)]
-        return np.where(piece > self.last_id, cut, piece).astype(piece.dtype)
+        return np.where(piece >= 0, self.origin[piece.clip(0, len(self.origin) - 1)], -1).astype(piece.dtype)
 
 
 class _Sorted(NamedTuple):
@@ -86,21 +86,19 @@ def cut_repeats(tracks: Tracks) -> Tracks:
 
 def cut_recording(recording: Recording) -> CutRecording:
     """A recording with its tracks cut by `cut_repeats`, and which piece is whose. Pixels stay where they are."""
-    is_valid, track_id = np.asarray(recording.is_valid), np.array(recording.track_id, np.int64)
-    last_id = int(track_id[is_valid].max(initial=-1))
+    is_valid, track_id = np.asarray(recording.is_valid), np.asarray(recording.track_id)
     frame, column = np.nonzero(is_valid)
-    uv_px = np.asarray(recording.uv_px, np.float64)[frame, column]
-    cut = cut_repeats(Tracks(frame, track_id[frame, column], uv_px)).track_id
-    pieces, first = np.unique(cut, return_index=True)
-    origin = track_id[frame, column][first[pieces > last_id]]
-    track_id[frame, column] = cut
-    if cut.max(initial=0) > np.iinfo(np.int32).max:
-        raise ValueError(
-            f"cut_recording: pieces are numbered from {last_id + 1} on, which passes 2³¹; number tracks from 0."
-        )
-    track_id = track_id.astype(np.asarray(recording.track_id).dtype)
-    changed = track_id, last_sightings(track_id, is_valid)
-    return CutRecording(eqx.tree_at(lambda r: (r.track_id, r.is_last), recording, changed), last_id, origin)
+    ids, uv_px = track_id[is_valid].astype(np.int64), np.asarray(recording.uv_px, np.float64)[is_valid]
+    cut = cut_repeats(Tracks(frame, ids, uv_px)).track_id
+    pieces, first, piece = np.unique(cut, return_index=True, return_inverse=True)
+    order = np.lexsort((ids[first], frame[first]))
+    rank = np.empty(len(order), track_id.dtype)
+    rank[order] = np.arange(len(order))
+    renamed = np.zeros_like(track_id)
+    renamed[frame, column] = rank[piece]
+    changed = renamed, last_sightings(renamed, is_valid)
+    whole = eqx.tree_at(lambda r: (r.track_id, r.is_last), recording, changed)
+    return CutRecording(whole, ids[first][order], len(pieces) - len(np.unique(ids)))
 
 
 def _sorted(tracks: Tracks) -> _Sorted:
