@@ -14,7 +14,6 @@ import pytest
 import recorded
 
 import vcjax as vc
-from vcjax.filter import stretches as module
 from vcjax.recorded.filtered import filter_recording
 from vcjax.recorded.unfinished import Unfinished
 
@@ -31,14 +30,6 @@ def stop_after(num_frames):
     return progress
 
 
-@pytest.fixture
-def short(monkeypatch):
-    """Stretches of eight frames."""
-    monkeypatch.setattr(
-        module.run_in_stretches, "__kwdefaults__", module.run_in_stretches.__kwdefaults__ | {"length": 8}
-    )
-
-
 def unfinished(folder, recording=None, **options) -> Unfinished:
     recording = recorded.content().recording if recording is None else recording
     return Unfinished(folder, recorded.config(**options), recording, every_s=0.0)
@@ -46,7 +37,11 @@ def unfinished(folder, recording=None, **options) -> Unfinished:
 
 def run(folder, progress=None, **options):
     return filter_recording(
-        recorded.config(**options), recorded.content().recording, progress, unfinished=unfinished(folder, **options)
+        recorded.config(**options),
+        recorded.content().recording,
+        progress,
+        unfinished=unfinished(folder, **options),
+        length=8,
     )
 
 
@@ -55,7 +50,7 @@ def assert_same(one, other):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.usefixtures("unchecked", "short")
+@pytest.mark.usefixtures("unchecked")
 def test_stopped_and_gone_on_is_the_same_to_the_bit(tmp_path):
     whole = filter_recording(recorded.config(), recorded.content().recording)
     folder = tmp_path / "unfinished"
@@ -72,7 +67,7 @@ def test_stopped_and_gone_on_is_the_same_to_the_bit(tmp_path):
     assert not folder.exists() and unfinished(folder).read() is None
 
 
-@pytest.mark.usefixtures("unchecked", "short")
+@pytest.mark.usefixtures("unchecked")
 def test_another_run_is_refused_and_damage_is_said(tmp_path):
     folder = tmp_path / "unfinished"
     with pytest.raises(Stopped):
@@ -102,10 +97,9 @@ _CHILD = f"""
 import sys
 sys.path.insert(0, {str(Path(recorded.__file__).parent)!r})
 import recorded
-from vcjax.filter import stretches
-from vcjax.recorded import unfinished
+from vcjax.recorded import filtered, unfinished
 unfinished.Unfinished.__init__.__defaults__ = (None, 0.0)
-stretches.run_in_stretches.__kwdefaults__["length"] = 2
+filtered.filter_recording.__kwdefaults__["length"] = 2
 from vcjax.cli import main
 sys.exit(main(sys.argv[1:]))
 """

@@ -17,7 +17,7 @@ from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.info import FrameInfo
 from vcjax.filter.known_landmarks import KnownLandmarks
 from vcjax.filter.landmark_points import LandmarkPoints, landmark_points
-from vcjax.filter.stretches import run_in_stretches
+from vcjax.filter.stretches import STRETCH, run_in_stretches
 from vcjax.recorded.unfinished import Unfinished
 from vcjax.recording import PER_FRAME, Recording
 
@@ -54,6 +54,7 @@ def filter_recording(
     known: KnownLandmarks | None = None,
     *,
     unfinished: Unfinished | None = None,
+    length: int = STRETCH,
 ) -> Filtered:
     """Filter a whole recording, however long.
 
@@ -64,6 +65,7 @@ def filter_recording(
         known: landmarks that are in the map from the start.
         unfinished: where work is kept that takes long, and where the same run goes on if it was stopped; of this
             configuration and recording. It stays until whoever asked removes it.
+        length: most frames in a stretch; work is written between two of them.
 
     Returns: infos as `vcjax.run` gives them, the map, and the time that it took.
 
@@ -74,10 +76,10 @@ def filter_recording(
     check_arguments("filter_recording", config, None)
     if config.birth_order == "random":
         raise ValueError("filter_recording(birth_order='random'): births of recordings go by id; take 'lowest_id'.")
-    run_in_stretches(config, recording, known=known)  # refuses what cannot be run
+    run_in_stretches(config, recording, known=known, length=length)  # refuses what cannot be run
     begun = None if unfinished is None else unfinished.read()
     begin = time.perf_counter()
-    for _ in run_in_stretches(config, _first_two(recording), known=known):
+    for _ in run_in_stretches(config, _first_two(recording), known=known, length=length):
         pass
     compiled = time.perf_counter()
 
@@ -88,7 +90,8 @@ def filter_recording(
             last.note(info.departed)
             infos.append(_without_departed(info))
     unsaved, saved = [], compiled
-    for stretch in run_in_stretches(config, recording, known=known, state=state, next_frame=next_frame):
+    going_on = {"length": length, "state": state, "next_frame": next_frame}
+    for stretch in run_in_stretches(config, recording, known=known, **going_on):
         last.note(stretch.info.departed)
         infos.append(_without_departed(stretch.info))
         if progress is not None:
