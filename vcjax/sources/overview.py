@@ -7,6 +7,7 @@ import numpy as np
 from vcjax.recording import Recording, moves_in_frame
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, TrackLabel
+from vcjax.sources.repeats import repeated_frames
 from vcjax.sources.tracks import tracks_of
 from vcjax.sources.warnings import warnings
 
@@ -88,6 +89,9 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     (seen, lengths), (image, path) = figure.subplots(2, 2)
 
     seen.plot(time_s, np.sum(np.asarray(recording.is_valid), axis=1), color=_BLUE)
+    if len(repeated := repeated_frames(tracks)):
+        seen.plot(time_s[repeated], np.zeros(len(repeated)), "|", color=_RED, markersize=12, label="most tracks repeat")
+        seen.legend(loc="lower right", fontsize=8)
     seen.set(xlabel="time (s)", ylabel="features seen", title="Features in each frame", ylim=(0, None))
     if len(length):
         bins = np.unique(np.rint(np.geomspace(1, length.max() + 1, 30))) - 0.5  # whole numbers in each
