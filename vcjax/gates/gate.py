@@ -198,3 +198,7 @@ class AbstractDetector(eqx.Module):
         A margin says by how much, in χ² units, what was seen exceeds what a static landmark may show; NaN where nothing
         can be said. What it decides is smoothed, or not, by `surrogates`.
         """
+
+    def velocity(self, state: PyTree) -> tuple[Float[Array, "*L 3"], Float[Array, "*L 3 3"]] | None:
+        """Estimated velocity of each slot's landmark, m/s, and its covariance, m²/s²; None: it estimates none."""
+        return None
