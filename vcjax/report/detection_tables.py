@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vcjax.report.detection_prediction import prediction_figure, prediction_markdown, predictions
 from vcjax.report.markup import grid, with_nulls
 from vcjax.report.style import RC, new_figure, write_figure
 from vcjax.storage import write_file
@@ -58,7 +59,7 @@ def detection_tables(runs: Runs) -> dict[str, Any]:
         harder scene's name as `label`. Beside them `methods`, the
         configuration of each, and `num_seeds`.
     """
-    cells, harder_cells, static_cells = [], [], []
+    cells, harder_cells, static_cells, predicted = [], [], [], predictions(runs)
     for (method, scene), found in runs.items():
         static = runs[method, scene.static]
         cell: dict[str, Any] = {
@@ -78,6 +79,8 @@ def detection_tables(runs: Runs) -> dict[str, Any]:
         cell |= scores(found, static)
         cell["static_scene_position_rmse_cm"] = scores(static, static)["position_rmse_cm"]
         cell["difference"] = _difference(found, static)
+        if (method, scene) in predicted:
+            cell["predicted"] = predicted[method, scene]
         (cells if scene.harder is None else harder_cells).append(cell)
     return {
         "num_seeds": max(int(found.sizes["seed"]) for found in runs.values()),
@@ -101,6 +104,8 @@ def detection_markdown(tables: Mapping[str, Any]) -> str:
         cells = [cell for cell in every if cell["amplitude_m"] == amplitude]
         scenes = dict.fromkeys(cell["label"] for cell in cells)
         sections.append(grid(_HEADER, [_row(cell) for scene in scenes for cell in cells if cell["label"] == scene]))
+    if predicted := [cell for cell in every if "predicted" in cell]:
+        sections += ["## Predicted before anything was run\n", prediction_markdown(predicted)]
     return "\n".join(sections)
 
 
@@ -121,6 +126,8 @@ def write_detection(runs: Runs, directory: Path) -> list[Path]:
         name = "" if dynamic_set == "ahead" else f"_{dynamic_set}"
         paths += write_figure(found_figure(tables | {"cells": chosen}), directory / "figures" / f"movers_found{name}")
         paths += write_figure(position_figure(tables | {"cells": chosen}), directory / "figures" / f"position{name}")
+    if predicted := [cell for cell in [*tables["cells"], *tables["harder_cells"]] if "predicted" in cell]:
+        paths += write_figure(prediction_figure(predicted), directory / "figures" / "predicted")
     return paths
 
 
