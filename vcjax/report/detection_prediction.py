@@ -18,17 +18,19 @@ from vcjax.study.detect import METHODS, Runs, Scene
 _HALF = 0.5
 """Power at which a mover counts as found when frames are predicted."""
 _INTRODUCTION = f"""\
-The power of the χ² test against each mover (see `vcjax detectability`), with all its frames in view and the method's
-threshold, and the mean over the movers of the frames after which it is {_HALF:g}, beside what the method found. A power at
-the false-alarm rate is what remains where a mover looks like a static feature at another place: one that comes straight
-towards a steady camera, at a speed βu against the camera's own u, is seen exactly as a static point at 1/(1 + β) of its
-distance, frame by frame, so that no test of its pixels can find it. A swing sideways does not shrink with the distance as
-the path does, and gives it away.
+The power of the χ² test against each mover (see `vcjax detectability`), with all its frames in view and the threshold
+of the method, and the mean over the movers of the frames after which it is {_HALF:g}, beside what the method found. A
+power at the false-alarm rate is what remains where a mover looks like a static feature at another place: one that
+comes straight towards a steady camera, at β times the camera's own speed, is seen exactly as a static point at 1/(1 +
+β) of its distance, frame by frame, so that no test of its pixels can find it. A swing sideways does not shrink with
+the distance as the path does, and gives it away.
 """
 
 
 def predictions(runs: Runs) -> dict[tuple[str, Scene], dict[str, float]]:
-    """What is predicted of the methods with a velocity test of a fixed threshold, in the scenes with movers.
+    """What is predicted of the methods with a velocity test of a fixed threshold.
+
+    In the scenes with movers but the harder ones, whose movers the prediction was not made for.
 
     Returns: for each, `found_fraction`, the mean power over the movers, and `delay_frames`, the mean number of frames
         until it is 0.5, of the movers whose power ever is; NaN where there is none.
@@ -36,7 +38,8 @@ def predictions(runs: Runs) -> dict[tuple[str, Scene], dict[str, float]]:
     result = {}
     for (method, scene), found in runs.items():
         detector = METHODS[method].detector
-        if scene.is_static or not isinstance(detector, VelocityGLR) or detector.threshold is None:
+        is_predicted = isinstance(detector, VelocityGLR) and detector.threshold is not None
+        if not is_predicted or scene.is_static or scene.harder is not None:
             continue
         test = VelocityTest(false_alarm_rate=float(survival(detector.threshold)))
         scenario = scene.scenario(found.sizes["frame"])
