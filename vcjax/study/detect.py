@@ -19,6 +19,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.gates.cusum import Cusum
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.immediate import Immediate
+from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.velocity_glr import VelocityGLR
 from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio
@@ -45,6 +46,7 @@ _WIDE_TH1 = 12.0
 METHODS: Mapping[str, FilterConfig] = {
     "VC": FilterConfig(gate=VirtualCorrection()),
     "RE": FilterConfig(gate=ReprojectionError()),
+    "one_point_ransac": FilterConfig(gate=OnePointRansac()),
     "RE+velocity_glr": _with(ReprojectionError(th1=_WIDE_TH1), VelocityGLR(threshold=20.0)),
     "VC+velocity_glr": _with(VirtualCorrection(), VelocityGLR(threshold=20.0)),
     "RE+velocity_likelihood_ratio": _with(ReprojectionError(th1=_WIDE_TH1), VelocityLikelihoodRatio()),
@@ -53,7 +55,8 @@ METHODS: Mapping[str, FilterConfig] = {
     "RE+immediate": _with(ReprojectionError(th1=_WIDE_TH1), Immediate()),
 }
 """What is compared, by name: one setting each for all scenes. VC and RE are the paper's, with the deletion rule of its
-toolbox; the others have a wider gate, the detector's own threshold, and flag for good."""
+toolbox, and so is the field's 1-point RANSAC; the others have a wider gate, the detector's own threshold, and flag for
+good."""
 
 
 class Scene(NamedTuple):
