@@ -18,6 +18,7 @@ from vcjax.filter.map_covariance import symmetric
 from vcjax.filter.state import SLOT, VEHICLE
 from vcjax.filter.submap import gather, scatter
 from vcjax.gates.gate import AbstractGate, Prior, Verdict
+from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.models.camera import Camera
 
@@ -243,3 +244,68 @@ def test_an_unmeasured_candidate_changes_nothing_whatever_its_pixel(problem):
         jax.tree.map(np.testing.assert_array_equal, dirty, clean)
     nobody = correct(SEQUENTIAL, state, slot, uv_px, np.zeros(K, bool))
     assert_same(nobody, dense_normalise(state), tolerance=1e-15)
+
+
+def supporters_of_the_best(state, slot, uv_px, is_measured, gate):
+    """Each measured candidate corrects a copy of the whole state, means alone; whom it leaves within pixel noise."""
+    best = np.zeros(K, bool), 0.0
+    for i in np.flatnonzero(is_measured):
+        z, H = dense_innovation(state, slot[i], uv_px[i])
+        S = H @ dense_cov(state) @ H.T + SEQUENTIAL.pixel_std_px**2 * np.eye(2)
+        if z @ np.linalg.solve(S, z) >= gate.th1:
+            continue
+        shift = dense_cov(state) @ H.T @ np.linalg.solve(S, z)
+        parts = [dense_innovation(state, slot[j], uv_px[j]) for j in range(K)]
+        squared = np.array([np.sum((z - H @ shift) ** 2) / SEQUENTIAL.pixel_std_px**2 for z, H in parts])
+        in_region = np.array(
+            [
+                z @ np.linalg.solve(H @ dense_cov(state) @ H.T + SEQUENTIAL.pixel_std_px**2 * np.eye(2), z) < gate.th1
+                for z, H in parts
+            ]
+        )
+        supports = is_measured & in_region & (squared < gate.th_consensus)
+        score = supports.sum() - squared[supports].sum() / (gate.th_consensus * (K + 1))
+        if score > best[1]:
+            best = supports, score
+    return best[0]
+
+
+@pytest.mark.parametrize("update", ["sequential", "stacked"])
+def test_ransac_corrects_with_the_best_set_and_then_with_the_rescued(problem, update):
+    """As dense updates; the pixels of two candidates are moved, by little and by much."""
+    state, slot, uv_px = problem
+    gate = OnePointRansac(th_consensus=4.0)
+    is_measured = np.arange(K) % 7 != 3
+    moved = uv_px + np.where(np.arange(K) == 1, 4.0, np.where(np.arange(K) == 5, 400.0, 0.0))[:, None]
+    hidden = np.where(is_measured[:, None], moved, np.nan)
+    config = FilterConfig(**CHOICES | dict(gate=gate, update=update))
+
+    accepted = supporters_of_the_best(state, slot, moved, is_measured, gate)
+    expected = state
+    if update == "stacked":
+        parts = [dense_innovation(state, slot[j], moved[j]) for j in np.flatnonzero(accepted)]
+        expected = dense_update(state, *(np.concatenate(part) for part in zip(*parts, strict=True)))
+    else:
+        for j in np.flatnonzero(accepted):
+            expected = dense_update(expected, *dense_innovation(expected, slot[j], moved[j]))
+    rescued = np.zeros(K, bool)
+    for j in np.flatnonzero(is_measured & ~accepted):
+        z, H = dense_innovation(expected, slot[j], moved[j])
+        S = H @ dense_cov(expected) @ H.T + config.pixel_std_px**2 * np.eye(2)
+        rescued[j] = z @ np.linalg.solve(S, z) < gate.th_rescue
+    for j in np.flatnonzero(rescued):
+        expected = dense_update(expected, *dense_innovation(expected, slot[j], moved[j]))
+
+    outcome = outcome_of(config, state, slot, hidden, is_measured)
+    np.testing.assert_array_equal(outcome.is_accepted, accepted)
+    np.testing.assert_array_equal(outcome.is_recovered, rescued)
+    assert not outcome.is_dynamic.any() and (outcome.dynamic_margin[5] > 0) and outcome.weight[5] == 0
+    assert accepted.sum() > 2 and rescued.any() and not (accepted | rescued)[[3, 5]].any()
+    assert_same(correct(config, state, slot, hidden, is_measured), dense_normalise(expected))
+
+
+@quick_jit
+def outcome_of(config, state, slot, uv_px, is_measured):
+    """What becomes of the candidates."""
+    _, submap, _ = gather(config, state, slot)
+    return correct_frame(config, Camera(), submap, uv_px, is_measured)[1]

@@ -174,5 +174,9 @@ def test_harder_scenes_stand_beside_their_static_ones(tmp_path, monkeypatch):
         detect(tmp_path, ["VC"], harder_scenes=("fog",), **options)
 
 
-def test_every_method_but_those_of_the_paper_flags_for_good():
-    assert {name for name, config in METHODS.items() if config.blacklist_capacity == 0} == {"VC", "RE"}
+def test_only_methods_with_a_detector_of_their_own_flag_for_good():
+    assert {name for name, config in METHODS.items() if config.blacklist_capacity == 0} == {
+        "VC",
+        "RE",
+        "one_point_ransac",
+    }

@@ -12,7 +12,7 @@ candidate must neither change a result nor a gradient.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -101,6 +101,8 @@ class AbstractGate(eqx.Module):
     """Where isolated candidates are judged: "corrected", after all formal corrections of the frame, with RE₁ < Th₁
     tested at the running state; or "predicted", with both at the state after prediction, as equation (13) is
     printed."""
+    condemns: ClassVar[bool] = True
+    """Whether what it judges and does not recover is dynamic, its landmark deleted at once; or only left out."""
 
     @abstractmethod
     def margin(self, re1: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -118,6 +120,30 @@ class AbstractGate(eqx.Module):
         is neither recovered nor dynamic. Margins have exact derivatives; what they decide is smoothed, or not, by
         `gates.surrogates`.
         """
+
+
+class Joint(NamedTuple):
+    """The innovations of a frame's K candidates at the predicted state, and their joint covariance."""
+
+    z: Float[Array, "K 2"]
+    """y - ê, px (8); 0 where not measured."""
+    S: Float[Array, "K K 2 2"]
+    """S_ij = H_i P H_jᵀ, and R where i = j (9), px². What is not measured has R, and depends on nothing."""
+    R: Float[Array, "2 2"]
+    """Pixel noise covariance, px²."""
+    is_measured: Bool[Array, " K"]
+    """Which candidates were found in the image."""
+
+
+class AbstractJointGate(AbstractGate):
+    """Update gate that accepts by all innovations of a frame together, at the predicted state.
+
+    Its `margin` says of one measurement alone whether it may be accepted at all.
+    """
+
+    @abstractmethod
+    def margins(self, joint: Joint) -> Float[Array, " K"]:
+        """By how much each candidate is accepted, in χ² units: where above 0. Anything where not measured."""
 
 
 class Evidence(eqx.Module):

@@ -19,6 +19,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.gates.cusum import Cusum
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.immediate import Immediate
+from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.velocity_glr import VelocityGLR
 from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio
@@ -50,6 +51,7 @@ _GLR = VelocityGLR(threshold=17.0)
 METHODS: Mapping[str, FilterConfig] = {
     "VC": FilterConfig(gate=VirtualCorrection()),
     "RE": FilterConfig(gate=ReprojectionError()),
+    "one_point_ransac": FilterConfig(gate=OnePointRansac()),
     "RE+velocity_glr": _with(ReprojectionError(), _GLR),
     "VC+velocity_glr": _with(VirtualCorrection(), _GLR),
     "RE+velocity_likelihood_ratio": _with(ReprojectionError(th1=_WIDE_TH1), VelocityLikelihoodRatio()),
@@ -58,7 +60,8 @@ METHODS: Mapping[str, FilterConfig] = {
     "RE+immediate": _with(ReprojectionError(th1=_WIDE_TH1), Immediate()),
 }
 """What is compared, by name: one setting each for all scenes. VC and RE are the paper's, with the deletion rule of its
-toolbox; the others have the detector's own threshold, correct with more landmarks, and flag for good."""
+toolbox, and so is the field's 1-point RANSAC; the others have the detector's own threshold, correct with more landmarks,
+and flag for good."""
 
 
 class Scene(NamedTuple):
