@@ -61,8 +61,7 @@ METHODS: Mapping[str, FilterConfig] = {
 }
 """What is compared, by name: one setting each for all scenes. VC and RE are the paper's, with the deletion rule of its
 toolbox, and so is the field's 1-point RANSAC; the others have the detector's own threshold, correct with more
-landmarks,
-and flag for good."""
+landmarks, and flag for good."""
 
 
 class Scene(NamedTuple):
