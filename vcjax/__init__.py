@@ -22,6 +22,7 @@ from vcjax.gates.cusum import Cusum as Cusum
 from vcjax.gates.either import Either as Either
 from vcjax.gates.immediate import Immediate as Immediate
 from vcjax.gates.inlier_ratio import InlierRatio as InlierRatio
+from vcjax.gates.one_point_ransac import OnePointRansac as OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError as ReprojectionError
 from vcjax.gates.velocity_glr import VelocityGLR as VelocityGLR
 from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio as VelocityLikelihoodRatio

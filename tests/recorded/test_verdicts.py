@@ -136,6 +136,17 @@ def test_summary_by_hand(info):
     assert "which it is not" not in text and "which it is not" in run_summary_text(found | {"nis": 6.0})
 
 
+def test_nothing_is_expected_of_a_gate_that_accepts_jointly(info):
+    filtered = Filtered(info, LastPlaces(np.array([4, 7]), np.zeros((2, 3)), np.zeros((2, 3, 3))), 12.5, 0.2)
+    recording = SimpleNamespace(time_s=np.array([10.0, 10.5, 12.0]), num_frames=3)
+    config = vc.FilterConfig(gate=vc.OnePointRansac())
+    found = run_summary(config, recording, filtered, track_verdicts(verdicts(info)))
+    assert all(math.isnan(found[name]) for name in ("nis_low", "nis_high", "beyond_gate_expected"))
+    assert found["nis"] == pytest.approx(2.0) and found["beyond_gate"] == pytest.approx(0.5)
+    text = run_summary_text(found)
+    assert "2.000 of the accepted\n" in text and "50.00 % of the measured\n" in text
+
+
 def test_first_failure_is_named(info):
     info.is_finite[1:] = False
     assert first_failure(info) == 1

@@ -60,7 +60,7 @@ class Run:
     config: FilterConfig
     """The filter."""
     gate: GateName = "VC"
-    """Update gate: RE (re-projection error) or VC (virtual correction)."""
+    """Update gate: RE (re-projection error), VC (virtual correction) or 1-point RANSAC with rescue."""
     detector: DetectorName = "inlier_ratio"
     """Which landmarks are deleted over time."""
     motion: MotionName = "odometry"
