@@ -20,6 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import PyTree
@@ -126,7 +127,6 @@ class Unfinished:
 
 def _first_frame(recording: Recording) -> Recording:
     """The first frame of a recording, which is enough to tell what the filter makes."""
-    import equinox as eqx
 
     def of_frames(recording):
         return [getattr(recording, name) for name in PER_FRAME]
@@ -157,7 +157,7 @@ def _read(path: Path, shapes: PyTree, others: Mapping[str, str], has_frames: boo
     kinds = {
         name: "iu" if leaf.dtype.kind in "iu" else leaf.dtype.kind for name, leaf in zip(names, leaves, strict=True)
     }
-    found = read_arrays(path, kinds | others)
+    found = read_arrays(path, {**kinds, **others})
     lengths = {found[name].shape[:1] for name in names if name in found} if has_frames else {()}
     length = next(iter(lengths), ())
     expected = {name: ((*length, *leaf.shape), leaf.dtype) for name, leaf in zip(names, leaves, strict=True)}
