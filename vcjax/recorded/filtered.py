@@ -18,8 +18,8 @@ from vcjax.filter.info import FrameInfo
 from vcjax.filter.known_landmarks import KnownLandmarks
 from vcjax.filter.landmark_points import LandmarkPoints, landmark_points
 from vcjax.filter.stretches import STRETCH, run_in_stretches
-from vcjax.recorded.unfinished import Unfinished
-from vcjax.recording import PER_FRAME, Recording
+from vcjax.recorded.unfinished import Unfinished, first_frames
+from vcjax.recording import Recording
 
 
 class LastPlaces(NamedTuple):
@@ -79,7 +79,7 @@ def filter_recording(
     run_in_stretches(config, recording, known=known, length=length)  # refuses what cannot be run
     begun = None if unfinished is None else unfinished.read()
     begin = time.perf_counter()
-    for _ in run_in_stretches(config, _first_two(recording), known=known, length=length):
+    for _ in run_in_stretches(config, first_frames(recording, 2), known=known, length=length):
         pass
     compiled = time.perf_counter()
 
@@ -114,15 +114,6 @@ def _without_departed(info: FrameInfo) -> FrameInfo:
 
 def _joined(infos: list[FrameInfo]) -> FrameInfo:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *infos)
-
-
-def _first_two(recording: Recording) -> Recording:
-    """The first frames of a recording: enough to compile all that the others need."""
-
-    def of_frames(recording):
-        return [getattr(recording, name) for name in PER_FRAME]
-
-    return eqx.tree_at(of_frames, recording, [leaf[:2] for leaf in of_frames(recording)])
 
 
 @jax.jit

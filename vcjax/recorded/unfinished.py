@@ -72,7 +72,7 @@ class Unfinished:
         """
         self.folder, self.every_s = Path(folder), every_s
         self._settings = _settings(config, recording, known)
-        first = jax.tree.map(np.asarray, _first_frame(recording))
+        first = jax.tree.map(np.asarray, first_frames(recording, 1))
         self._shapes = jax.eval_shape(lambda r: start(config, r, None, known), first)
 
     def read(self) -> Begun | None:
@@ -125,13 +125,13 @@ class Unfinished:
         return self.folder / f"frames_{first:06d}.npz"
 
 
-def _first_frame(recording: Recording) -> Recording:
-    """The first frame of a recording, which is enough to tell what the filter makes."""
+def first_frames(recording: Recording, num: int) -> Recording:
+    """The first frames of a recording: one tells what the filter makes, two compile all that the others need."""
 
     def of_frames(recording):
         return [getattr(recording, name) for name in PER_FRAME]
 
-    return eqx.tree_at(of_frames, recording, [leaf[:1] for leaf in of_frames(recording)])
+    return eqx.tree_at(of_frames, recording, [leaf[:num] for leaf in of_frames(recording)])
 
 
 def _settings(config: FilterConfig, recording: Recording, known: KnownLandmarks | None) -> dict[str, Any]:
