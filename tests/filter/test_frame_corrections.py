@@ -12,7 +12,6 @@ from filter_runs import CAPACITY, filtered, head, quick_jit, recorded
 
 from vcjax.fields import number
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.evidence import landmark_gains
 from vcjax.filter.features import Block, observe, predict_features
 from vcjax.filter.frame_corrections import correct_frame
 from vcjax.filter.map_covariance import symmetric
@@ -172,47 +171,25 @@ def test_soft_corrections_are_joseph_updates_of_a_smaller_gain(problem, weight):
     assert_same(correct(config, state, slot, uv_px, is_measured), dense_normalise(expected))
 
 
-@quick_jit
-def gains(config, state, slot, uv_px, is_measured):
-    """What a detector is told of the frame's gains."""
-    _, submap, _ = gather(config, state, slot)
-    submap, _ = correct_frame(config, Camera(), submap, uv_px, is_measured)
-    return landmark_gains(submap, K)
-
-
-def own_rows(gain, slot):
-    """Of a gain (N, 2 K) by the innovations at prediction: each landmark's rows, and its own innovation's columns."""
-    rows = VEHICLE + SLOT * slot[:, None] + np.arange(SLOT)
-    return np.stack([gain[rows[k], 2 * k : 2 * k + 2] for k in range(K)])
-
-
-def test_gains_are_those_of_dense_updates_one_after_another(problem):
-    """Correction j sees its innovation at prediction less H_j A, A the gain so far: A ← A + K_j (e_j - H_j A)."""
+def test_a_landmark_s_own_rows_are_those_of_the_covariance_as_it_was_gated(problem):
+    """P Hᵀ after the corrections before it, whether it is used itself or not."""
     state, slot, uv_px = problem
     is_measured = np.arange(K) % 4 != 3
-    now, A = state, np.zeros((VEHICLE + SLOT * state.track_id.shape[0], 2 * K))
-    for j in np.flatnonzero(is_measured):
+    found = np.asarray(innovations(SEQUENTIAL, state, slot, uv_px, is_measured).PH_l)
+    now = state
+    for j in range(K):
         z, H = dense_innovation(now, slot[j], uv_px[j])
-        P = dense_cov(now)
-        kalman = P @ H.T @ np.linalg.inv(H @ P @ H.T + SEQUENTIAL.pixel_std_px**2 * np.eye(2))
-        own = np.arange(2 * K) == 2 * j + np.arange(2)[:, None]
-        A, now = A + kalman @ (own - H @ A), dense_update(now, z, H)
-    found = gains(SEQUENTIAL, state, slot, uv_px, is_measured)
-    np.testing.assert_allclose(found, own_rows(A, slot), rtol=0, atol=1e-11)
-    assert (np.asarray(found)[~is_measured] == 0).all() and np.abs(found).max() > 1e-3
+        rows = VEHICLE + SLOT * slot[j] + np.arange(SLOT)
+        np.testing.assert_allclose(found[j], (dense_cov(now) @ H.T)[rows], rtol=0, atol=1e-11)
+        now = dense_update(now, z, H) if is_measured[j] else now
+    assert np.abs(found).max() > 1e-3
 
 
-def test_stacked_gains_are_the_batch_formula(problem):
-    state, slot, uv_px = problem
-    is_measured = np.arange(K) % 4 != 3
-    used = np.flatnonzero(is_measured)
-    H = np.concatenate([dense_innovation(state, slot[j], uv_px[j])[1] for j in used])
-    P = dense_cov(state)
-    kalman = P @ H.T @ np.linalg.inv(H @ P @ H.T + STACKED.pixel_std_px**2 * np.eye(len(H)))
-    A = np.zeros((len(P), 2 * K))
-    A[:, (2 * used[:, None] + np.arange(2)).ravel()] = kalman
-    found = gains(STACKED, state, slot, uv_px, is_measured)
-    np.testing.assert_allclose(found, own_rows(A, slot), rtol=0, atol=1e-11)
+@quick_jit
+def innovations(config, state, slot, uv_px, is_measured):
+    """Those of the candidates as they were gated."""
+    _, submap, _ = gather(config, state, slot)
+    return correct_frame(config, Camera(), submap, uv_px, is_measured)[1].innovation
 
 
 def test_skipping_free_slots_changes_nothing(problem):

@@ -98,8 +98,8 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
         "landscape.png", "landscape_scene_1.png", "landscape_scene_2.png", "curves.png", "roc_by_scene.png"
     }  # fmt: skip
 
-    steps = [Step({TH1: 9.0 + k, TH2: 9.0 - k}, 1.0, 0.5, np.nan, {TH1: 0.1, TH2: 0.2}, {}, k) for k in range(3)]
-    steps.append(Step({TH1: 12.0, TH2: 6.0}, 1.0, np.nan, np.nan, {TH1: np.nan, TH2: np.nan}, {}, 4))
+    steps = [Step({TH1: 9.0 + k, TH2: 9.0 - k}, 1.0, 0.5, np.nan, {TH1: 0.1, TH2: 0.2}, {}, {}, k) for k in range(3)]
+    steps.append(Step({TH1: 12.0, TH2: 6.0}, 1.0, np.nan, np.nan, {TH1: np.nan, TH2: np.nan}, {}, {}, 4))
     paths = write_tuning(Tuned([steps, steps], choice, 64), {"thresholds": as_grid(choice)}, tmp_path / "tune")
     content = json.loads((tmp_path / "tune" / "tune.json").read_text())
     assert content["before"]["parameters"] == choice.before and content["after"]["parameters"] == choice.after

@@ -47,6 +47,8 @@ class Innovation(NamedTuple):
     """Predicted inside the image."""
     H_l: Float[Array, "*b 2 7"]
     """The landmark's part of H, by the errors of its slot."""
+    PH_l: Float[Array, "*b 7 2"]
+    """Its rows of P Hᵀ."""
 
 
 class Gain(NamedTuple):
@@ -69,7 +71,8 @@ def innovate(
     HP = H @ block_rows(submap, submap.P, j) - HU @ submap.U
     S = block_columns(submap, HP, j) @ H.T + pixel_cov(config, H.dtype)
     z, is_visible = uv_px - observation.pixel, observation.is_visible
-    return Innovation(observation.pixel, z, S, mahalanobis(z, S), is_visible, H[:, -SLOT:]), Gain(H, HP, HU)
+    PH_l = block_columns(submap, HP, j)[:, -SLOT:].T
+    return Innovation(observation.pixel, z, S, mahalanobis(z, S), is_visible, H[:, -SLOT:], PH_l), Gain(H, HP, HU)
 
 
 def innovate_jointly(

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 from vcjax.fields import require_kind
 from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig, check_arguments
+from vcjax.filter.correction import pixel_cov
 from vcjax.filter.evidence import evidence_of
 from vcjax.filter.features import choose, match, predict_features
 from vcjax.filter.following import follow
@@ -99,7 +100,8 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         jnp.where(is_measured, innovation.is_visible, prediction.is_visible[slot])
     )
     is_watched = state.is_mapped & ~is_dynamic
-    evidence = evidence_of(submap, outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, frame.time_step_s)
+    R = pixel_cov(config, innovation.S.dtype)
+    evidence = evidence_of(outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, R, frame.time_step_s)
     detector, margin = config.detector.observe(_of_mapped(config, state), evidence)
     margin = jnp.where(is_watched, margin, jnp.nan).astype(state.P_vv.dtype)
     is_flagged = margin > 0

@@ -19,6 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+SLOT = 7
+"""Error coordinates of a slot."""
 Prior = Literal["corrected", "predicted"]
 PRIORS = ("corrected", "predicted")
 
@@ -152,7 +154,7 @@ class Evidence(eqx.Module):
     is_searched: Bool[Array, " K"]
     """Chosen for update in this frame. The rest is false or meaningless where this is false."""
     is_measured: Bool[Array, " K"]
-    """Found in the image. The numbers below are meaningless where this is false, but for weight and gain, zero."""
+    """Found in the image. The numbers below are meaningless where this is false, but for the weight, zero."""
     is_corrected: Bool[Array, " K"]
     """Used in a formal correction, accepted or recovered."""
     weight: Float[Array, " K"]
@@ -163,9 +165,10 @@ class Evidence(eqx.Module):
     """S, its covariance, px². Equation (9)."""
     H: Float[Array, "K 2 7"]
     """Derivative of the pixel by the landmark's part of the state, in its slot's error coordinates."""
-    gain: Float[Array, "K 7 2"]
-    """The landmark's own rows of the gain, weighted: what the frame's corrections moved its slot by, per px of its
-    innovation; zero where it was not used."""
+    PH: Float[Array, "K 7 2"]
+    """The landmark's own rows of P Hᵀ as gated, whether it was used or not: times S⁻¹ its own rows of the gain."""
+    pixel_cov: Float[Array, "2 2"]
+    """R, of the noise of a pixel, px²."""
     re1: Float[Array, " K"]
     """RE₁ as gated (13)."""
     dynamic_margin: Float[Array, " K"]
@@ -224,3 +227,7 @@ class AbstractDetector(eqx.Module):
         A margin says by how much, in χ² units, what was seen exceeds what a static landmark may show; NaN where nothing
         can be said. What it decides is smoothed, or not, by `surrogates`.
         """
+
+    def velocity(self, state: PyTree) -> tuple[Float[Array, "*L 3"], Float[Array, "*L 3 3"]] | None:
+        """Estimated velocity of each slot's landmark, m/s, and its covariance, m²/s²; None: it estimates none."""
+        return None
