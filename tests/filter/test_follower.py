@@ -35,11 +35,11 @@ def plainly(following, place, cov, distance, pixels):
     x = np.concatenate([place, np.zeros(3)])
     P = np.zeros((6, 6))
     P[:3, :3] = cov + (following.relative_place_std * distance) ** 2 * np.eye(3)
-    P[3:, 3:] = following.velocity_std_m_s**2 * np.eye(3)
+    P[3:, 3:] = following.follower_velocity_std_m_s**2 * np.eye(3)
     q, Q, misfit, at_rest = place.copy(), P[:3, :3].copy(), 0.0, 0
-    keep = np.exp(-STEP_S / following.correlation_s)
+    keep = np.exp(-STEP_S / following.velocity_memory_s)
     F = np.block([[np.eye(3), STEP_S * np.eye(3)], [np.zeros((3, 3)), keep * np.eye(3)]])
-    noise = np.diag([0.0] * 3 + [following.velocity_std_m_s**2 * (1 - keep**2)] * 3)
+    noise = np.diag([0.0] * 3 + [following.follower_velocity_std_m_s**2 * (1 - keep**2)] * 3)
 
     def corrected(x, P, J, z):
         S = J @ P @ J.T + N
@@ -66,7 +66,7 @@ def step_bent(following, followers, sight):
 
 def test_both_models_are_the_plain_ones():
     """One follower moves, stands, moves; another place is free, a third one's pixels are missing now and then."""
-    rng, following = np.random.default_rng(0), Following(capacity=3, rest_limit=12.0)
+    rng, following = np.random.default_rng(0), Following(max_followed=3, rest_limit=12.0)
     places, distances = np.array([[1.0, -0.5, 6.0], [0.0, 0.0, 1.0], [-2.0, 1.0, 9.0]]), np.array([6.0, 1.0, 9.0])
     covs = 0.01 * np.stack([np.eye(3)] * 3)
     followers = begin(following, *map(jnp.array, (np.array([7, -1, 4], np.int32), places, covs, distances)))
@@ -115,8 +115,12 @@ def followed(following, start, velocity, key):
 
 def test_velocity_is_consistent_where_measurement_is_linear():
     """Velocities drawn as the model says: the NEES of place and velocity at the end is χ² with 6 degrees of freedom."""
-    following, rng, num = Following(velocity_std_m_s=0.4, correlation_s=2.0), np.random.default_rng(1), 400
-    keep = np.exp(-STEP_S / following.correlation_s)
+    following, rng, num = (
+        Following(follower_follower_velocity_std_m_s=0.4, velocity_memory_s=2.0),
+        np.random.default_rng(1),
+        400,
+    )
+    keep = np.exp(-STEP_S / following.velocity_memory_s)
     velocity = np.zeros((num, 40, 3))
     velocity[:, 0] = 0.4 * rng.normal(size=(num, 3))
     for t in range(1, 40):
@@ -146,7 +150,7 @@ def test_what_stands_is_seldom_taken_to_move_and_what_moves_never_to_stand():
 
 
 def test_a_pixel_from_elsewhere_loses_the_feature():
-    following = Following(capacity=1)
+    following = Following(max_followed=1)
     followers = begin(following, jnp.zeros(1, jnp.int32), jnp.array([[0.0, 0, 5]]), jnp.zeros((1, 3, 3)), jnp.ones(1))
     _, is_lost = step_bent(following, followers, Sight(jnp.ones(1, bool), jnp.array([[9e3, 0.0]])))
     assert is_lost.all()
@@ -158,13 +162,13 @@ def test_a_pixel_from_elsewhere_loses_the_feature():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: Following(capacity=-1), r"Following\(capacity=-1\)"),
+        (lambda: Following(max_followed=-1), r"Following\(max_followed=-1\)"),
         (lambda: Following(rest_frames=0), r"Following\(rest_frames=0\)"),
         (lambda: Following(rest_limit=-1.0), r"Following\(rest_limit=-1.0\): .*positive"),
-        (lambda: Following(velocity_std_m_s=np.inf), r"Following\(velocity_std_m_s=inf\)"),
+        (lambda: Following(follower_velocity_std_m_s=np.inf), r"Following\(follower_velocity_std_m_s=inf\)"),
         (
-            lambda: FilterConfig(following=Following(capacity=4)),
-            r"capacity=4.*must stay out of the map; set blacklist_capacity",
+            lambda: FilterConfig(following=Following(max_followed=4)),
+            r"max_followed=4.*must stay out of the map; set blacklist_capacity",
         ),
         (lambda: FilterConfig(following=True, blacklist_capacity=9), r"following=True.*give a Following"),
     ],

@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from filter_runs import frame_of, head, quick_jit
+from filter_runs import frame_of, head, quick_jit, start
 
 import vcjax as vc
 from vcjax.filter.follower import Following
 from vcjax.filter.following import follow
 from vcjax.filter.run import run
-from vcjax.filter.slam import start
 from vcjax.simulation.scenarios import harder
 from vcjax.simulation.simulate import simulate
 
@@ -23,7 +22,7 @@ CONFIG = vc.FilterConfig(
     detector=vc.VelocityGLR(threshold=20.0),
     blacklist_capacity=64,
     see_beyond_infinity=True,
-    following=Following(capacity=16),
+    following=Following(max_followed=16),
 )
 
 
@@ -88,7 +87,7 @@ def test_velocity_is_near_the_truth(runs):
     assert len(error) > 200 and np.sqrt(np.mean(error[:, 1] ** 2)) < 0.2
     cov = info.followers.cov[seed, t, k][:, 3:, 3:]
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error)
-    assert 0.2 * 3 < nees.mean() < 2.0 * 3
+    assert 0.05 * 3 < nees.mean() < 1.5 * 3  # below 3: a constant velocity is steadier than the model allows
 
 
 def test_what_is_followed_is_out_of_the_map_and_on_the_blacklist_until_it_is_handed_back(runs):
@@ -116,7 +115,7 @@ def test_the_filter_does_not_know_that_it_is_followed(runs):
 
 def test_the_newest_take_the_places_of_the_oldest(runs):
     recording = jax.tree.map(lambda leaf: leaf[0], runs[0])
-    config = dataclasses.replace(CONFIG, following=Following(capacity=3))
+    config = dataclasses.replace(CONFIG, following=Following(max_followed=3))
     state = start(config, head(recording, 1))[0]
     mapped = np.flatnonzero(state.is_mapped)
     ids = np.asarray(state.track_id)
@@ -126,6 +125,6 @@ def test_the_newest_take_the_places_of_the_oldest(runs):
     for deleted in (mapped[:2], mapped[2:4], []):
         is_deleted = jnp.zeros(len(ids), bool).at[jnp.array(deleted, int)].set(True)
         left = dataclasses.replace(state, track_id=jnp.full(len(ids), -1, jnp.int32))
-        after, _ = follow(config, state, left, is_deleted, frame)
+        after, _ = quick_jit(follow)(config, state, left, is_deleted, frame)
         state = dataclasses.replace(state, followers=after.followers)
     assert state.followers.track_id.tolist() == [ids[mapped[2]], ids[mapped[3]], ids[mapped[0]]]

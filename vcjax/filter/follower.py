@@ -39,25 +39,25 @@ from vcjax.fields import number, require, require_count
 class Following(eqx.Module):
     """How flagged features are followed, and when they are handed back."""
 
-    capacity: int = eqx.field(static=True, default=0)
+    max_followed: int = eqx.field(static=True, default=0)
     """How many are followed at once, the newest taking the places of the oldest; 0: none, at no cost."""
     rest_frames: int = eqx.field(static=True, default=20)
     """For how many of its pixels a feature must have stood still to be handed back, at least 1."""
     rest_limit: float = eqx.field(converter=number, default=12.0)
     """h, Page's sum above which it did not; positive. One that stands still is taken to move in at most one of twenty
     windows of 20 pixels, and then has to wait for another."""
-    velocity_std_m_s: float = eqx.field(converter=number, default=0.5)
+    follower_velocity_std_m_s: float = eqx.field(converter=number, default=0.5)
     """σ of each component of the velocity, m/s; positive."""
-    correlation_s: float = eqx.field(converter=number, default=5.0)
+    velocity_memory_s: float = eqx.field(converter=number, default=5.0)
     """τ, for how long a velocity is kept, s; positive."""
     relative_place_std: float = eqx.field(converter=number, default=0.3)
     """Standard deviation of a new follower's place on each axis, as a share of its distance from the camera; positive.
     It is added to what the map knows: the place that a mover has in the map is not where it is."""
 
     def __check_init__(self):
-        require_count(self, "capacity", 0)
+        require_count(self, "max_followed", 0)
         require_count(self, "rest_frames", 1)
-        for name in ("rest_limit", "velocity_std_m_s", "correlation_s", "relative_place_std"):
+        for name in ("rest_limit", "follower_velocity_std_m_s", "velocity_memory_s", "relative_place_std"):
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
 
 
@@ -84,7 +84,7 @@ class Followers(NamedTuple):
 
 def nobody(following: Following, dtype) -> Followers:
     """No follower in any place."""
-    num = following.capacity
+    num = following.max_followed
     return begin(
         following,
         jnp.full(num, -1, jnp.int32),
@@ -104,7 +104,7 @@ def begin(
     """New followers at places that a map had them at, with covariances, and distances from the camera."""
     eye, zero = jnp.eye(3, dtype=cov.dtype), jnp.zeros(cov.shape, cov.dtype)
     cov = cov + ((following.relative_place_std * distance_m) ** 2)[:, None, None] * eye
-    velocity_cov = jnp.broadcast_to(following.velocity_std_m_s**2 * eye, cov.shape)
+    velocity_cov = jnp.broadcast_to(following.follower_velocity_std_m_s**2 * eye, cov.shape)
     none = jnp.zeros(track_id.shape, cov.dtype)
     whole = jnp.block([[cov, zero], [zero, velocity_cov]])
     return Followers(track_id, place_m, jnp.zeros_like(place_m), whole, place_m, cov, none, none)
@@ -112,10 +112,12 @@ def begin(
 
 def advance(following: Following, followers: Followers, time_step_s: Float[Array, ""]) -> Followers:
     """All that moves, moved by a frame."""
-    keep = jnp.exp(-time_step_s / following.correlation_s)
+    keep = jnp.exp(-time_step_s / following.velocity_memory_s)
     F = jnp.eye(6, dtype=followers.cov.dtype).at[jnp.arange(3), jnp.arange(3, 6)].set(time_step_s)
     F = F.at[jnp.arange(3, 6), jnp.arange(3, 6)].set(keep)
-    Q = jnp.diag(jnp.repeat(jnp.stack([jnp.zeros_like(keep), following.velocity_std_m_s**2 * (1 - keep**2)]), 3))
+    Q = jnp.diag(
+        jnp.repeat(jnp.stack([jnp.zeros_like(keep), following.follower_velocity_std_m_s**2 * (1 - keep**2)]), 3)
+    )
     return followers._replace(
         place_m=followers.place_m + time_step_s * followers.velocity_m_s,
         velocity_m_s=keep * followers.velocity_m_s,

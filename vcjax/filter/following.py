@@ -48,7 +48,7 @@ def follow(
     followers = followers._replace(track_id=jnp.where(is_done, FREE, followers.track_id))
 
     everyone = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), _taken_up(config, before, is_deleted), followers)
-    newest_first = jnp.argsort(everyone.track_id == FREE, stable=True)[: config.following.capacity]
+    newest_first = jnp.argsort(everyone.track_id == FREE, stable=True)[: config.following.max_followed]
     followers = jax.tree.map(lambda leaf: leaf[newest_first], everyone)
     is_free = jnp.any(state.blacklist[:, None] == back_id, axis=1)
     blacklist = jnp.where(is_free, FREE, state.blacklist)

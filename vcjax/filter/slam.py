@@ -221,7 +221,9 @@ def start(
         detector_margin=jnp.full(L, jnp.nan, dtype),
         p_detector=jnp.zeros(L, dtype),
         inconsistent_id=jnp.full(L, FREE, jnp.int32),
-        handed_back_id=jnp.full(config.following.capacity, FREE, jnp.int32) if config.following.capacity else None,
+        handed_back_id=jnp.full(config.following.max_followed, FREE, jnp.int32)
+        if config.following.max_followed
+        else None,
     )
     info_of_candidates["departed"] = landmark_points(state, jnp.zeros_like(state.is_mapped))
     is_mapped = jnp.zeros_like(frame.is_valid) if known is None else jnp.isin(frame.track_id, known.track_id)

@@ -121,7 +121,7 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
         detector=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_slots, *leaf.shape)), config.detector.born()),
         blacklist=jnp.full(config.blacklist_capacity, FREE, jnp.int32),
         blacklist_left=jnp.zeros(config.blacklist_capacity, dtype),
-        followers=nobody(config.following, dtype) if config.following.capacity else None,
+        followers=nobody(config.following, dtype) if config.following.max_followed else None,
         key=key,
     )
 
