@@ -48,11 +48,11 @@ def main(study: Study) -> None:
             frames[frames == 0] = np.nan
             is_told = np.isfinite(error) & np.isfinite(without) & np.isfinite(frames).any(axis=1)
             damage, exposure = (error - without)[is_told], np.nanmean(frames[is_told], axis=1)
-            rank = stats.spearmanr(exposure, damage)
+            correlation, p_value = stats.spearmanr(exposure, damage)
             print(
                 f"  {folder.name}: {len(damage)} seeds, static scene {without[is_told].mean():.2f} cm, "
-                f"damage {_mean(damage)} cm; rank correlation with time in the map {rank.statistic:+.2f} "
-                f"(p = {rank.pvalue:.2f})"
+                f"damage {_mean(damage)} cm; rank correlation with time in the map {correlation:+.2f} "
+                f"(p = {p_value:.2f})"
             )
             for third in np.array_split(np.argsort(exposure), 3):
                 print(f"    {exposure[third].mean():5.1f} frames in the map: {_mean(damage[third])} cm")

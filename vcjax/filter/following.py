@@ -35,10 +35,11 @@ def follow(
 
     Returns: the state, and the features that were handed back (-1 elsewhere); None if nothing is followed.
     """
-    if before.followers is None:
+    followers = before.followers
+    if followers is None:
         return state, None
-    before, frame = jax.lax.stop_gradient((before, frame))
-    followers = advance(config.following, before.followers, frame.time_step_s)
+    before, followers, frame = jax.lax.stop_gradient((before, followers, frame))
+    followers = advance(config.following, followers, frame.time_step_s)
     is_match = (followers.track_id[:, None] == frame.track_id) & frame.is_valid & (followers.track_id >= 0)[:, None]
     sight = Sight(jnp.any(is_match, axis=1), frame.uv_px[jnp.argmax(is_match, axis=1)])
     followers, is_lost = watch(config.following, followers, sight, _measure(config, before, frame))
