@@ -8,6 +8,7 @@ nothing, starts no device and leaves JAX's configuration alone; for the paper's 
 import typing
 
 from vcjax.filter.config import FilterConfig as FilterConfig
+from vcjax.filter.follower import Following as Following
 from vcjax.filter.info import FrameInfo as FrameInfo
 from vcjax.filter.known_landmarks import KnownLandmarks as KnownLandmarks
 from vcjax.filter.motion_model import BiasedOdometry as BiasedOdometry

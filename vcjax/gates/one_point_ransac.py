@@ -58,7 +58,7 @@ class OnePointRansac(AbstractJointGate):
             require(self, name, lambda th: th > 0, "a threshold on a squared distance is positive (5.99 is 95 %).")
 
     @property
-    def prior(self) -> Prior:
+    def prior(self) -> Prior:  # type: ignore[override]
         """The rescue is at the corrected state."""
         return "corrected"
 
