@@ -81,6 +81,6 @@ class FrameInfo(eqx.Module):
     """Whether the vehicle's mean and covariance are finite numbers."""
 
     @property
-    def is_blind(self) -> Bool[Array, ""]:
+    def is_blind(self) -> Bool[Array, "*T"]:
         """Whether no pixel corrected the state: it follows its motion alone, and its covariance grows."""
         return ~jnp.any(self.is_accepted | self.is_recovered, axis=-1)

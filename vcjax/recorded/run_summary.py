@@ -67,6 +67,8 @@ def run_summary(
         "first_failure": failure,
         "failures": int(np.sum(~np.asarray(info.is_finite))),
         "frames_map_full": int(np.sum(info.map_is_full)),
+        "frames_blind": int(np.sum(np.asarray(info.is_blind)[1:])),
+        "end_std_m": float(np.sqrt(np.trace(np.asarray(info.vehicle_cov, np.float64)[-1, :3, :3]))),
     }
 
 
@@ -88,7 +90,11 @@ def run_summary_text(found: dict[str, Any]) -> str:
     is_expected = not math.isnan(found["nis_low"])
     failed = "none" if found["first_failure"] is None else f"not finite from frame {found['first_failure']} on"
     rows = [
-        ("frames", f"{found['frames']} of {found['duration_s']:.4g} s"),
+        (
+            "frames",
+            f"{found['frames']} of {found['duration_s']:.4g} s; {found['frames_blind']} after the first are blind, "
+            "corrected by nothing",
+        ),
         (
             "speed",
             f"{found['run_s']:.3g} s, {found['times_real_time']:.3g} times real time; "
@@ -117,6 +123,13 @@ def run_summary_text(found: dict[str, Any]) -> str:
                 else ""
             ),
         ),
+        ("place at the end", f"known to {found['end_std_m']:.3g} m, by the filter's own covariance"),
         ("failures", failed),
     ]
+    if found.get("scale") is not None:
+        by = f"; lengths are multiplied by {found['scale_factor']:.4g}" if found["scale_factor"] != 1.0 else ""
+        free = ": lengths are those of the priors, and mean nothing" if found["scale"] == "free" else by
+        rows.insert(1, ("scale", f"{found['scale']}{free}"))
+    if found.get("tracks_cut") is not None:
+        rows.insert(1, ("tracks", f"cut at {found['tracks_cut']} sightings that repeat the one before"))
     return "\n".join(f"{name:16s} {text}" for name, text in rows)
