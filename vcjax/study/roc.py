@@ -43,12 +43,12 @@ def track_scores(runs: Any) -> Any:
     return score.where(score.notnull(), -np.inf).where(is_track)
 
 
-def area_of_each(score: Float[np.ndarray, "*r F"], is_mover: Bool[np.ndarray, "*r F"]) -> Float[np.ndarray, "*r"]:
+def area_of_each(score: Float[np.ndarray, "*r F"], is_mover: Bool[np.ndarray, "... F"]) -> Float[np.ndarray, "*r"]:
     """Area under the ROC of each run by itself, from the mean ranks of its tracks (Mann–Whitney).
 
     Args:
         score: NaN of what does not count as a track.
-        is_mover: labels.
+        is_mover: labels, for each run or for all.
 
     Returns: the share of pairs of a mover and another in the right order, ties half; NaN where there are no pairs.
     """

@@ -63,7 +63,8 @@ def check_blocks(
         refuse_other_settings(path, load_attributes(path, KEPT), origin)
         if path.name not in places:
             raise ValueError(
-                f"{path} is of another number of settings than {num_settings}; give another directory, or remove this one."
+                f"{path} is of another number of settings than {num_settings}; "
+                "give another directory, or remove this one."
             )
 
 
