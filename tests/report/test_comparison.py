@@ -121,6 +121,14 @@ def test_a_descents_figure_names_its_numbers_as_the_landscape_does():
     assert titles == ["smoothed objective", "Th₁", "pixel_std_px"]
 
 
+def test_one_scene_stands_for_all_and_a_setting_that_stays_is_told(choice):
+    one = choice._replace(held_out=choice.held_out.isel(scene=[0]))
+    text = comparison_markdown(comparison(one))
+    assert f"| {SCENES[0]} |" in text and f"| {ALL} |" not in text and "No candidate" not in text
+    stays = comparison_markdown(comparison(choice._replace(after=choice.before)))
+    assert "No candidate is better than the setting before" in stays
+
+
 def test_search_and_tuning_are_written_whole(choice, tmp_path):
     paths = write_search(choice, tmp_path / "sweep")
     assert all(path.is_file() and path.stat().st_size > 0 for path in paths)
@@ -162,3 +170,5 @@ def test_the_landscape_shows_every_mean_in_its_place(choice):
         assert axes.get_xscale() == axes.get_yscale() == "log"
     linear = grid.assign_coords({TH1: [1.0, 2.0, 3.0]})
     assert landscape_figure(linear, "title").axes[0].get_xlim() == (0.5, 3.5)
+    two = landscape_figure(grid.isel({TH1: [0, 2]}).isel({TH2: [1, 2]}), "title").axes[0]
+    assert (two.get_xscale(), two.get_yscale()) == ("log", "linear") and two.get_xlim() == pytest.approx((2, 32))

@@ -103,7 +103,8 @@ def test_means_of_a_grid_do_not_skip_a_run_that_failed(found):
 def test_a_candidate_with_a_run_that_failed_is_not_chosen(found, monkeypatch):
     """Though the mean of its others is the least."""
     best = int(found.candidates.loss.mean(("scene", "seed")).argmin())
-    place = {"setting": best, "scene": "1.0 m/s", "seed": int(found.candidates.loss[best, 1].argmax())}
+    scene, seed = np.unravel_index(found.candidates.loss[best].argmax(), found.candidates.loss[best].shape)
+    place = {"setting": best, "scene": list(SCENES)[scene], "seed": int(seed)}
     failed = with_failed_run(found.candidates, **place)
     assert int(failed.loss.mean(("scene", "seed")).argmin()) == best
     monkeypatch.setattr(module, "evaluate", lambda *_, **__: failed)

@@ -10,7 +10,7 @@ import xarray as xr
 from vcjax.report.markup import grid
 from vcjax.study import roc
 from vcjax.study.summary import mean_and_error, student_t
-from vcjax.tuning.choice import COMPARED, FALSE_RATE, RECALL, Choice, by_scene, tracks_of
+from vcjax.tuning.choice import ALL, COMPARED, FALSE_RATE, RECALL, Choice, by_scene, tracks_of
 
 _DECIMALS = dict.fromkeys((*COMPARED, RECALL), 2) | {
     "loss": 3,
@@ -104,8 +104,11 @@ def comparison_markdown(compared: Mapping[str, Any]) -> str:
     if before["seeds_failed"] or after["seeds_failed"]:
         introduction += _FAILED.format(before=before["seeds_failed"], after=after["seeds_failed"])
     sections = [grid(["parameter", "before", "after"], rows), introduction]
+    if before["parameters"] == after["parameters"]:
+        sections.insert(1, "No candidate is better than the setting before, which stays.\n")
+    scenes = [name for name in compared["paired"] if name != ALL or len(compared["paired"]) > 2]
     for figures in _TABLES:
-        rows = [[scene, *(_cell(compared, scene, figure) for figure in figures)] for scene in compared["paired"]]
+        rows = [[scene, *(_cell(compared, scene, figure) for figure in figures)] for scene in scenes]
         sections.append(grid(["scene", *(_LABELS[figure] for figure in figures)], rows))
     return "\n".join(sections)
 

@@ -60,10 +60,10 @@ def landscape_figure(
             way = [p[x] for p in path], [p[y] for p in path]
             axes.plot(*way, color="black", linewidth=2.4)  # an outline, for bright ground
             axes.plot(*way, color="white", linewidth=1.2, marker=".", markersize=3)
-        for (mark, setting), symbol in zip((marks or {}).items(), "os^D", strict=False):
-            axes.plot(
-                setting[x], setting[y], symbol, color="#d55e00", markeredgecolor="white", markersize=8, label=mark
-            )
+        # One setting may be another: then the mark of the first is seen around that of the second.
+        for (mark, setting), symbol, size in zip((marks or {}).items(), "os^D", (12, 8, 8, 8), strict=False):
+            style = {"color": "#d55e00", "markeredgecolor": "white", "markersize": size, "label": mark}
+            axes.plot(setting[x], setting[y], symbol, **style)
         axes.label_outer()
     if marks:
         handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -73,8 +73,10 @@ def landscape_figure(
 
 
 def _is_log(values: np.ndarray) -> bool:
-    """Whether values are spread by equal factors."""
-    return len(values) > 2 and bool(values[0] > 0 and np.ptp(np.diff(np.log(values))) < 1e-6)
+    """Whether values are spread by equal factors; two, if by equal steps their cells would reach below 0."""
+    if len(values) < 2 or values[0] <= 0:
+        return False
+    return bool(values[1] > 3 * values[0]) if len(values) == 2 else bool(np.ptp(np.diff(np.log(values))) < 1e-6)
 
 
 def _edges(values: np.ndarray) -> np.ndarray:
