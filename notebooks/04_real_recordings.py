@@ -115,7 +115,7 @@ assert num_moving >= 20
 config = vc.FilterConfig(gate=vc.VirtualCorrection(), choose_among="measured", births_per_frame=3, pixel_std_px=0.5)
 filtered = filter_recording(config, content.recording)
 passed = verdicts(filtered.info)
-tracks = track_verdicts(passed)
+tracks = track_verdicts(passed, filtered.info)
 numbers = run_summary(config, content.recording, filtered, tracks)
 print(run_summary_text(numbers))
 assert numbers["failures"] == 0 and numbers["frames_map_full"] == 0

@@ -49,6 +49,8 @@ class Study:
     """Runs of each scene by which the best descent is chosen."""
     held_out_seeds: int = 200
     """Runs of each scene on which the two are compared."""
+    key: int = 0
+    """Number of the random keys, of which each of the three parts has its own."""
     out: Path = Path("results/gradient_against_grid")
     """Directory; work that was stopped goes on there."""
 
@@ -65,6 +67,7 @@ def main(study: Study) -> None:
         axes = {path: np.linspace(i.low, i.high, study.points + 1)[1:] for path, i in intervals.items()}
     schedule = Schedule(num_steps=study.steps, pairs_per_step=study.pairs, learning_rate=study.learning_rate)
     config = vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")
+    gradient_key, grid_key, held_out_key = (jax.random.key(3 * study.key + part) for part in (1, 2, 3))
     tuned = tune(
         scenarios,
         config,
@@ -73,7 +76,7 @@ def main(study: Study) -> None:
         schedule=schedule,
         num_starts=study.starts,
         seeds=Seeds(study.choosing_seeds, 100),
-        key=jax.random.key(1),
+        key=gradient_key,
         directory=directory / "gradient",
         progress=lambda *done: print("gradient:", *done, flush=True),
     )
@@ -83,7 +86,7 @@ def main(study: Study) -> None:
         axes,
         objective=WANTED,
         seeds=Seeds(study.grid_seeds, 100),
-        key=jax.random.key(2),
+        key=grid_key,
         directory=directory / "grid",
         progress=lambda *done: print("grid:", *done, flush=True),
     )
@@ -97,7 +100,7 @@ def main(study: Study) -> None:
         {path: [setting[path] for setting in settings.values()] for path in intervals},
         objective=WANTED,
         num_seeds=study.held_out_seeds,
-        key=jax.random.key(3),
+        key=held_out_key,
         directory=directory / "held_out",
     )
     loss = runs.loss.mean("scene", skipna=False)

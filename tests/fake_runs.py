@@ -73,6 +73,8 @@ def fake_runs(cell: Cell | None = None, num_seeds: int = 4, num_frames: int = 20
             "num_coordinates": (per_frame, np.tile(77 + 7 * frames, (num_seeds, 1))),
             "dynamic_deletions": (("seed", "feature"), dynamic_deletions),
             "inconsistent_deletions": (("seed", "feature"), inconsistent_deletions),
+            "velocity_error_m_s": (("seed", "feature"), np.full(dynamic_deletions.shape, np.nan)),
+            "velocity_nees": (("seed", "feature"), np.full(dynamic_deletions.shape, np.nan)),
             "frames_mapped": (("seed", "feature"), np.full((num_seeds, len(features)), num_frames)),
             "first_mapped": (("seed", "feature"), np.ones((num_seeds, len(features)), int)),
             "first_deleted": (

@@ -54,6 +54,19 @@ def test_detector_is_the_one_named_with_options_of_its_own(name, tmp_path, monke
     assert describe(seen[0].detector) == describe(expected.get(name, DETECTORS[name or "inlier_ratio"]()))
 
 
+@pytest.mark.parametrize("detector", ["inlier_ratio", "velocity_glr"])
+def test_what_is_flagged_can_be_followed(detector, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    monkeypatch.setattr(
+        "vcjax.commands.simulate.monte_carlo", lambda _, config, **__: seen.append(config) or fake_runs(num_seeds=2)
+    )
+    options = ["--max-followed", "8", "--rest-frames", "30", "--rest-limit", "9", "--blacklist-capacity", "64"]
+    assert main(["simulate", "--gate", "RE", "--detector", detector, *options]) == 0
+    following = vc.Following(max_followed=8, rest_frames=30, rest_limit=9)
+    assert describe(seen[0].following) == describe(following)
+
+
 def test_numbers_given_reach_the_filter(tmp_path, monkeypatch, capsys):
     seen = []
     monkeypatch.setattr(
@@ -168,6 +181,7 @@ def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsy
         ("simulate --detector XX", ["'XX'", "--detector", "velocity_glr"]),
         ("simulate --detector velocity_glr --false-alarm-rate 2", ["VelocityGLR(false_alarm_rate=2.0)", "(0, 1)"]),
         ("simulate --detector velocity_glr --forgetting 0.9", ["VelocityGLR(forgetting=0.9)", "give a threshold"]),
+        ("simulate --max-followed 8", ["Following(max_followed=8)", "set blacklist_capacity"]),
         ("simulate --blacklist-frames -1", ["FilterConfig(blacklist_frames=-1.0)", "infinity: for good"]),
     ],
 )
@@ -202,7 +216,7 @@ def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path)
 
     monkeypatch.setattr("vcjax.commands.paper.reproduce", interrupt)
     assert main(["reproduce", "--out", str(tmp_path)]) == 130
-    assert "stopped; what `reproduce`, `detect`, `tune` and `sweep` have finished is on disk" in said(capsys)[1]
+    assert "stopped; what `reproduce`, `detect`, `tune`, `sweep` and `run` have finished is on disk" in said(capsys)[1]
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ nothing, starts no device and leaves JAX's configuration alone; for the paper's 
 import typing
 
 from vcjax.filter.config import FilterConfig as FilterConfig
+from vcjax.filter.follower import Following as Following
 from vcjax.filter.info import FrameInfo as FrameInfo
 from vcjax.filter.known_landmarks import KnownLandmarks as KnownLandmarks
 from vcjax.filter.motion_model import BiasedOdometry as BiasedOdometry
@@ -22,6 +23,7 @@ from vcjax.gates.cusum import Cusum as Cusum
 from vcjax.gates.either import Either as Either
 from vcjax.gates.immediate import Immediate as Immediate
 from vcjax.gates.inlier_ratio import InlierRatio as InlierRatio
+from vcjax.gates.one_point_ransac import OnePointRansac as OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError as ReprojectionError
 from vcjax.gates.velocity_glr import VelocityGLR as VelocityGLR
 from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio as VelocityLikelihoodRatio

@@ -1,6 +1,7 @@
 """The `vcjax` command. Its options are made from the configuration classes by tyro."""
 
 import contextlib
+import dataclasses
 import io
 import sys
 import traceback
@@ -25,6 +26,7 @@ from vcjax.commands.sweep import Sweep
 from vcjax.commands.track import Track
 from vcjax.commands.tune import Tune
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.motion_model import MOTIONS
 from vcjax.study.reproduce import DETECTORS, GATES
 
 WITHOUT_DEVICES = (Report, Track, Record, Inspect, Evaluate)
@@ -55,8 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         say(
             console,
-            "vcjax: stopped; what `reproduce`, `detect`, `tune` and `sweep` have finished is on disk, and they go on "
-            "there.",
+            "vcjax: stopped; what `reproduce`, `detect`, `tune`, `sweep` and `run` have finished is on disk, and they "
+            "go on there.",
         )
         return 130
     return 0
@@ -67,7 +69,10 @@ def _parse(arguments: list[str]) -> Any:
     gate = _named(arguments, "--gate", GATES, "VC")
     detector = _named(arguments, "--detector", DETECTORS, "inlier_ratio")
     config = FilterConfig(gate=GATES[gate](), detector=DETECTORS[detector]())
-    simulate, run = Simulate(scenario=tyro.MISSING, config=config), Run(recording=tyro.MISSING, config=config)
+    simulate = Simulate(scenario=tyro.MISSING, config=config)
+    motion = MOTIONS[_named(arguments, "--motion", MOTIONS, "odometry")]()
+    config = dataclasses.replace(config, motion=motion)
+    run = Run(recording=tyro.MISSING, config=config)
     union = (
         Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
         | Annotated[Report, tyro.conf.subcommand("report")]

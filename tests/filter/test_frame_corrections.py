@@ -12,13 +12,13 @@ from filter_runs import CAPACITY, filtered, head, quick_jit, recorded
 
 from vcjax.fields import number
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.evidence import landmark_gains
 from vcjax.filter.features import Block, observe, predict_features
 from vcjax.filter.frame_corrections import correct_frame
 from vcjax.filter.map_covariance import symmetric
 from vcjax.filter.state import SLOT, VEHICLE
 from vcjax.filter.submap import gather, scatter
 from vcjax.gates.gate import AbstractGate, Prior, Verdict
+from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.models.camera import Camera
 
@@ -171,47 +171,25 @@ def test_soft_corrections_are_joseph_updates_of_a_smaller_gain(problem, weight):
     assert_same(correct(config, state, slot, uv_px, is_measured), dense_normalise(expected))
 
 
-@quick_jit
-def gains(config, state, slot, uv_px, is_measured):
-    """What a detector is told of the frame's gains."""
-    _, submap, _ = gather(config, state, slot)
-    submap, _ = correct_frame(config, Camera(), submap, uv_px, is_measured)
-    return landmark_gains(submap, K)
-
-
-def own_rows(gain, slot):
-    """Of a gain (N, 2 K) by the innovations at prediction: each landmark's rows, and its own innovation's columns."""
-    rows = VEHICLE + SLOT * slot[:, None] + np.arange(SLOT)
-    return np.stack([gain[rows[k], 2 * k : 2 * k + 2] for k in range(K)])
-
-
-def test_gains_are_those_of_dense_updates_one_after_another(problem):
-    """Correction j sees its innovation at prediction less H_j A, A the gain so far: A ← A + K_j (e_j - H_j A)."""
+def test_a_landmark_s_own_rows_are_those_of_the_covariance_as_it_was_gated(problem):
+    """P Hᵀ after the corrections before it, whether it is used itself or not."""
     state, slot, uv_px = problem
     is_measured = np.arange(K) % 4 != 3
-    now, A = state, np.zeros((VEHICLE + SLOT * state.track_id.shape[0], 2 * K))
-    for j in np.flatnonzero(is_measured):
+    found = np.asarray(innovations(SEQUENTIAL, state, slot, uv_px, is_measured).PH_l)
+    now = state
+    for j in range(K):
         z, H = dense_innovation(now, slot[j], uv_px[j])
-        P = dense_cov(now)
-        kalman = P @ H.T @ np.linalg.inv(H @ P @ H.T + SEQUENTIAL.pixel_std_px**2 * np.eye(2))
-        own = np.arange(2 * K) == 2 * j + np.arange(2)[:, None]
-        A, now = A + kalman @ (own - H @ A), dense_update(now, z, H)
-    found = gains(SEQUENTIAL, state, slot, uv_px, is_measured)
-    np.testing.assert_allclose(found, own_rows(A, slot), rtol=0, atol=1e-11)
-    assert (np.asarray(found)[~is_measured] == 0).all() and np.abs(found).max() > 1e-3
+        rows = VEHICLE + SLOT * slot[j] + np.arange(SLOT)
+        np.testing.assert_allclose(found[j], (dense_cov(now) @ H.T)[rows], rtol=0, atol=1e-11)
+        now = dense_update(now, z, H) if is_measured[j] else now
+    assert np.abs(found).max() > 1e-3
 
 
-def test_stacked_gains_are_the_batch_formula(problem):
-    state, slot, uv_px = problem
-    is_measured = np.arange(K) % 4 != 3
-    used = np.flatnonzero(is_measured)
-    H = np.concatenate([dense_innovation(state, slot[j], uv_px[j])[1] for j in used])
-    P = dense_cov(state)
-    kalman = P @ H.T @ np.linalg.inv(H @ P @ H.T + STACKED.pixel_std_px**2 * np.eye(len(H)))
-    A = np.zeros((len(P), 2 * K))
-    A[:, (2 * used[:, None] + np.arange(2)).ravel()] = kalman
-    found = gains(STACKED, state, slot, uv_px, is_measured)
-    np.testing.assert_allclose(found, own_rows(A, slot), rtol=0, atol=1e-11)
+@quick_jit
+def innovations(config, state, slot, uv_px, is_measured):
+    """Those of the candidates as they were gated."""
+    _, submap, _ = gather(config, state, slot)
+    return correct_frame(config, Camera(), submap, uv_px, is_measured)[1].innovation
 
 
 def test_skipping_free_slots_changes_nothing(problem):
@@ -266,3 +244,68 @@ def test_an_unmeasured_candidate_changes_nothing_whatever_its_pixel(problem):
         jax.tree.map(np.testing.assert_array_equal, dirty, clean)
     nobody = correct(SEQUENTIAL, state, slot, uv_px, np.zeros(K, bool))
     assert_same(nobody, dense_normalise(state), tolerance=1e-15)
+
+
+def supporters_of_the_best(state, slot, uv_px, is_measured, gate):
+    """Each measured candidate corrects a copy of the whole state, means alone; whom it leaves within pixel noise."""
+    best = np.zeros(K, bool), 0.0
+    for i in np.flatnonzero(is_measured):
+        z, H = dense_innovation(state, slot[i], uv_px[i])
+        S = H @ dense_cov(state) @ H.T + SEQUENTIAL.pixel_std_px**2 * np.eye(2)
+        if z @ np.linalg.solve(S, z) >= gate.th1:
+            continue
+        shift = dense_cov(state) @ H.T @ np.linalg.solve(S, z)
+        parts = [dense_innovation(state, slot[j], uv_px[j]) for j in range(K)]
+        squared = np.array([np.sum((z - H @ shift) ** 2) / SEQUENTIAL.pixel_std_px**2 for z, H in parts])
+        in_region = np.array(
+            [
+                z @ np.linalg.solve(H @ dense_cov(state) @ H.T + SEQUENTIAL.pixel_std_px**2 * np.eye(2), z) < gate.th1
+                for z, H in parts
+            ]
+        )
+        supports = is_measured & in_region & (squared < gate.th_consensus)
+        score = supports.sum() - squared[supports].sum() / (gate.th_consensus * (K + 1))
+        if score > best[1]:
+            best = supports, score
+    return best[0]
+
+
+@pytest.mark.parametrize("update", ["sequential", "stacked"])
+def test_ransac_corrects_with_the_best_set_and_then_with_the_rescued(problem, update):
+    """As dense updates; the pixels of two candidates are moved, by little and by much."""
+    state, slot, uv_px = problem
+    gate = OnePointRansac(th_consensus=4.0)
+    is_measured = np.arange(K) % 7 != 3
+    moved = uv_px + np.where(np.arange(K) == 1, 4.0, np.where(np.arange(K) == 5, 400.0, 0.0))[:, None]
+    hidden = np.where(is_measured[:, None], moved, np.nan)
+    config = FilterConfig(**CHOICES | dict(gate=gate, update=update))
+
+    accepted = supporters_of_the_best(state, slot, moved, is_measured, gate)
+    expected = state
+    if update == "stacked":
+        parts = [dense_innovation(state, slot[j], moved[j]) for j in np.flatnonzero(accepted)]
+        expected = dense_update(state, *(np.concatenate(part) for part in zip(*parts, strict=True)))
+    else:
+        for j in np.flatnonzero(accepted):
+            expected = dense_update(expected, *dense_innovation(expected, slot[j], moved[j]))
+    rescued = np.zeros(K, bool)
+    for j in np.flatnonzero(is_measured & ~accepted):
+        z, H = dense_innovation(expected, slot[j], moved[j])
+        S = H @ dense_cov(expected) @ H.T + config.pixel_std_px**2 * np.eye(2)
+        rescued[j] = z @ np.linalg.solve(S, z) < gate.th_rescue
+    for j in np.flatnonzero(rescued):
+        expected = dense_update(expected, *dense_innovation(expected, slot[j], moved[j]))
+
+    outcome = outcome_of(config, state, slot, hidden, is_measured)
+    np.testing.assert_array_equal(outcome.is_accepted, accepted)
+    np.testing.assert_array_equal(outcome.is_recovered, rescued)
+    assert not outcome.is_dynamic.any() and (outcome.dynamic_margin[5] > 0) and outcome.weight[5] == 0
+    assert accepted.sum() > 2 and rescued.any() and not (accepted | rescued)[[3, 5]].any()
+    assert_same(correct(config, state, slot, hidden, is_measured), dense_normalise(expected))
+
+
+@quick_jit
+def outcome_of(config, state, slot, uv_px, is_measured):
+    """What becomes of the candidates."""
+    _, submap, _ = gather(config, state, slot)
+    return correct_frame(config, Camera(), submap, uv_px, is_measured)[1]

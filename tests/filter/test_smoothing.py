@@ -15,6 +15,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.filter.info import FrameInfo
 from vcjax.filter.run import run
 from vcjax.filter.slam import start, step
+from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import paper
@@ -31,6 +32,12 @@ PARAMETERS = {
 AT, STEPS = (np.array(column) for column in zip(*PARAMETERS.values(), strict=True))
 # Thresholds so low that a few frames hold recovered and dynamic features.
 STRICT = VirtualCorrection(th1=1.0, th2=0.7)
+GATES = [
+    STRICT,
+    dataclasses.replace(STRICT, prior="predicted"),
+    ReprojectionError(1.0),
+    OnePointRansac(th1=4.0, th_consensus=1.0, th_rescue=1.0),
+]
 quick_run = jax.jit(run, compiler_options=QUICK)
 
 
@@ -50,13 +57,14 @@ def decisions(info: FrameInfo) -> dict[str, np.ndarray]:
     return {name: np.asarray(getattr(info, name)) for name in names}
 
 
-@pytest.mark.parametrize("gate", [STRICT, dataclasses.replace(STRICT, prior="predicted"), ReprojectionError(1.0)])
+@pytest.mark.parametrize("gate", GATES)
 def test_straight_through_is_the_hard_filter_to_the_bit(gate):
     # Compiled as users have it: the quick options round as suits the program around.
     hard_state, hard = run(config(gate), recording())
     state, info = run(config(gate, smoothing="straight_through"), recording())
     assert hard.is_accepted.any() and (hard.is_measured & ~hard.is_accepted).any()
-    assert isinstance(gate, ReprojectionError) or (hard.is_recovered.any() and hard.is_dynamic.any())
+    assert isinstance(gate, ReprojectionError) or hard.is_recovered.any()
+    assert isinstance(gate, VirtualCorrection) == hard.is_dynamic.any()
     # Soft here and hard there; here of every measured candidate, there of the isolated.
     judged = ("p_dynamic", "p_detector", "re1_prior", "re2")
     for name in (field.name for field in dataclasses.fields(FrameInfo) if field.name not in judged):
@@ -65,11 +73,14 @@ def test_straight_through_is_the_hard_filter_to_the_bit(gate):
     np.testing.assert_array_equal(state.vehicle, hard_state.vehicle)
     np.testing.assert_array_equal(state.landmarks[mapped], hard_state.landmarks[mapped])
     np.testing.assert_array_equal(state.P_vv, hard_state.P_vv)
-    isolated = ~np.isnan(np.asarray(hard.re2))
-    np.testing.assert_array_equal(np.asarray(info.re2)[isolated], np.asarray(hard.re2)[isolated])
+    isolated = ~np.isnan(np.asarray(hard.re1_prior))
+    for name in ("re1_prior", "re2"):
+        np.testing.assert_array_equal(
+            np.asarray(getattr(info, name))[isolated], np.asarray(getattr(hard, name))[isolated]
+        )
 
 
-@pytest.mark.parametrize("gate", [STRICT, dataclasses.replace(STRICT, prior="predicted"), ReprojectionError(1.0)])
+@pytest.mark.parametrize("gate", GATES)
 def test_soft_tends_to_hard_as_the_temperature_falls(gate):
     _, hard = quick_run(config(gate), recording())
     _, soft = quick_run(config(gate, smoothing="soft", temperature=1e-9), recording())
@@ -77,7 +88,7 @@ def test_soft_tends_to_hard_as_the_temperature_falls(gate):
         np.testing.assert_array_equal(getattr(soft, name), expected, err_msg=name)
     np.testing.assert_allclose(soft.vehicle, hard.vehicle, rtol=0, atol=1e-10)
     np.testing.assert_allclose(soft.vehicle_cov, hard.vehicle_cov, rtol=0, atol=1e-12)
-    expected = hard.is_dynamic if isinstance(gate, VirtualCorrection) else hard.is_measured & ~hard.is_accepted
+    expected = hard.is_measured & ~(hard.is_accepted | hard.is_recovered)
     np.testing.assert_allclose(soft.p_dynamic, expected, atol=1e-9)
     _, warm = quick_run(config(gate, smoothing="soft", temperature=1.0), recording())
     assert np.abs(np.asarray(warm.vehicle - hard.vehicle)).max() > 1e-4  # it is not the same filter
@@ -134,11 +145,18 @@ def test_soft_gradient_is_the_finite_difference_through_a_whole_run():
     check_gradient(scenarios, None, range(4), {})
 
 
-@pytest.mark.parametrize("smoothing", ["soft", pytest.param("straight_through", marks=pytest.mark.slow)])
-def test_gradients_are_finite_whatever_the_map_holds(smoothing):
+@pytest.mark.parametrize(
+    ("gate", "smoothing"),
+    [
+        (VirtualCorrection, "soft"),
+        (OnePointRansac, "soft"),
+        pytest.param(VirtualCorrection, "straight_through", marks=pytest.mark.slow),
+    ],
+)
+def test_gradients_are_finite_whatever_the_map_holds(gate, smoothing):
     """Two thousand random states of one frame: empty and full maps, nothing measured, inverse depths at their clamp,
     points behind the camera and at its centre, pixels far off, covariances near zero; and both kinds of landmarks."""
-    filter_config = config(VirtualCorrection(), smoothing=smoothing, reverse_mode=True)
+    filter_config = config(gate(), smoothing=smoothing, reverse_mode=True)
     first = start(filter_config, recording())[0]
     middle = jax.jit(run, compiler_options=QUICK)(filter_config, recording())[0]
     frame = recording().frame(recording().num_frames - 1)
@@ -164,10 +182,11 @@ def test_gradients_are_finite_whatever_the_map_holds(smoothing):
 
     def value(parameters, key):
         th1, th2, pixel_std_px, shift = parameters
-        gate = VirtualCorrection(th1, th2)
         state, frame = disturbed(key)
         frame = dataclasses.replace(frame, sensor_shift_m=frame.sensor_shift_m + shift)
-        state, info = step(dataclasses.replace(filter_config, gate=gate, pixel_std_px=pixel_std_px), state, frame)
+        state, info = step(
+            dataclasses.replace(filter_config, gate=gate(th1, th2), pixel_std_px=pixel_std_px), state, frame
+        )
         return jnp.sum(info.p_dynamic) + jnp.sum(info.vehicle) + jnp.sum(info.vehicle_cov) * 1e3
 
     def batch(keys):

@@ -20,7 +20,8 @@ def evidence(slot, num_slots, **fields) -> Evidence:
         innovation=np.zeros((len(slot), 2)),
         innovation_cov=np.tile(np.eye(2), (len(slot), 1, 1)),
         H=np.zeros((len(slot), 2, 7)),
-        gain=np.zeros((len(slot), 7, 2)),
+        PH=np.zeros((len(slot), 7, 2)),
+        pixel_cov=np.eye(2),
         re1=np.zeros(len(slot)),
         dynamic_margin=np.full(len(slot), -9.0),
         is_visible=np.ones(num_slots, bool),
@@ -59,9 +60,13 @@ def random_record(seed, num_frames=40, num_slots=5, num_candidates=3) -> dict:
     S = A @ A.mT + np.eye(2)
     z = 2 * rng.normal(size=(*shape, 2))
     re1 = np.einsum("tka,tkab,tkb->tk", z, np.linalg.inv(S), z)
-    gain = np.where(is_corrected[..., None, None], 0.03 * rng.normal(size=(*shape, 7, 2)), 0.0)
     numbers = dict(
-        innovation=z, innovation_cov=S, H=5 * rng.normal(size=(*shape, 2, 7)), re1=re1, dynamic_margin=re1 - 9
+        innovation=z,
+        innovation_cov=S,
+        H=5 * rng.normal(size=(*shape, 2, 7)),
+        PH=0.05 * rng.normal(size=(*shape, 7, 2)),
+        re1=re1,
+        dynamic_margin=re1 - 9,
     )
     is_found = is_searched & is_measured
     numbers = {k: np.where(is_found.reshape(*shape, *(1,) * (v.ndim - 2)), v, np.nan) for k, v in numbers.items()}
@@ -71,7 +76,7 @@ def random_record(seed, num_frames=40, num_slots=5, num_candidates=3) -> dict:
         is_measured=is_measured,
         is_corrected=np.where(is_searched, is_corrected, rng.random(shape) < 0.5),
         weight=is_corrected.astype(float),
-        gain=gain,
+        pixel_cov=np.tile(0.5 * np.eye(2), (num_frames, 1, 1)),
         is_visible=rng.random((num_frames, num_slots)) < 0.8,
         time_step_s=rng.uniform(0.05, 0.2, num_frames),
     )

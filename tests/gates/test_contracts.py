@@ -14,6 +14,7 @@ from vcjax.fields import number
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.gate import AbstractDetector, AbstractGate, Prior, Verdict
 from vcjax.gates.inlier_ratio import InlierRatio
+from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.virtual_correction import VirtualCorrection
 
@@ -71,7 +72,7 @@ def test_new_detector_remembers_each_slot():
     np.testing.assert_array_equal(np.argwhere(np.array(margins) > 0), [[1, 2], [2, 2]])
 
 
-GATES = [ReprojectionError(), VirtualCorrection(), PixelDistance()]
+GATES = [ReprojectionError(), VirtualCorrection(), OnePointRansac(), PixelDistance()]
 DETECTORS = [InlierRatio(), Largest()]
 
 

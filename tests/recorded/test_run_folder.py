@@ -17,7 +17,7 @@ def write(folder, table="csv", **changes):
     """Write the rendered run."""
     filtered, recording = recorded.run(), recorded.content().recording
     passed = verdicts(filtered.info)
-    tracks = track_verdicts(passed)
+    tracks = track_verdicts(passed, filtered.info)
     summary = run_summary(recorded.config(), recording, filtered, tracks) | {"recording": "a.npz"} | changes
     with new_run(folder, recording, filtered, passed, tracks, summary, table) as new:
         (new / "features").mkdir()
@@ -82,7 +82,7 @@ def test_a_run_that_fails_leaves_the_one_before(tmp_path):
     filtered, recording = recorded.run(), recorded.content().recording
     passed = verdicts(filtered.info)
     with pytest.raises(RuntimeError), new_run(
-        folder, recording, filtered, passed, track_verdicts(passed), {"first_failure": None}, "csv"
+        folder, recording, filtered, passed, track_verdicts(passed, filtered.info), {"first_failure": None}, "csv"
     ):  # fmt: skip
         raise RuntimeError("no more of this")
     assert contents(folder) == before and [p.name for p in tmp_path.iterdir()] == ["run"]
@@ -110,18 +110,18 @@ BAD = {
     "NaN in the path": ("robot_tum.txt", b"1 nan 0 0 0 0 0 1\n", "'nan' is not a finite number"),
     "no tracks": ("tracks.csv", None, r"tracks\.csv: no such file"),
     "other columns": ("tracks.csv", b"track_id,margin\n1,2\n", "no column accepted"),
-    "negative id": ("tracks.csv", b"{head}-1,0,0,0,0,0,1\n", "line 2, column track_id: -1 is below 0"),
-    "negative count": ("tracks.csv", b"{head}1,0,0,-2,0,0,1\n", "line 2, column dynamic: -2 is below 0"),
-    "track twice": ("tracks.csv", b"{head}1,0,0,0,0,0,1\n1,0,0,0,0,0,1\n", "line 3, .*not above the one before"),
-    "infinite": ("tracks.csv", b"{head}1,0,0,0,0,0,inf\n", "line 2, column margin: inf"),
-    "half a count": ("tracks.csv", b"{head}1,0,0.5,0,0,0,1\n", "'0.5' is not a whole number"),
+    "negative id": ("tracks.csv", b"{head}-1,0,0,0,0,0,1,1\n", "line 2, column track_id: -1 is below 0"),
+    "negative count": ("tracks.csv", b"{head}1,0,0,-2,0,0,1,1\n", "line 2, column dynamic: -2 is below 0"),
+    "track twice": ("tracks.csv", b"{head}1,0,0,0,0,0,1,1\n1,0,0,0,0,0,1,1\n", "line 3, .*not above the one before"),
+    "infinite": ("tracks.csv", b"{head}1,0,0,0,0,0,inf,1\n", "line 2, column margin: inf"),
+    "half a count": ("tracks.csv", b"{head}1,0,0.5,0,0,0,1,1\n", "'0.5' is not a whole number"),
 }
 
 
 @pytest.mark.parametrize(("name", "content", "message"), BAD.values(), ids=BAD)
 def test_damaged_folder_is_refused_by_file_and_place(tmp_path, name, content, message):
     write(tmp_path)
-    head = b"track_id,accepted,recovered,dynamic,rejected,deleted,margin\n"
+    head = b"track_id,accepted,recovered,dynamic,rejected,deleted,margin,detector_margin\n"
     if content is None:
         (tmp_path / name).unlink()
     else:

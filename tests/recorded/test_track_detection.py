@@ -15,21 +15,24 @@ from vcjax.sources.recording_file import RecordingFile, TrackLabel, TrackLabels
 from vcjax.study import roc
 
 
-def judged(margin, called) -> TrackVerdicts:
-    """Tracks 0, 1, … with their margin, some of which were called dynamic."""
+def judged(margin, called, detector_margin=None) -> TrackVerdicts:
+    """Tracks 0, 1, … with their margins, some of which were called dynamic."""
     counts = np.zeros((len(margin), 5), np.int64)
     counts[:, 2] = called
-    return TrackVerdicts(np.arange(len(margin)), counts, np.array(margin, float))
+    detector = margin if detector_margin is None else detector_margin
+    return TrackVerdicts(np.arange(len(margin)), counts, np.array(margin, float), np.array(detector, float))
 
 
 def test_counts_and_figures_by_hand():
     """Tracks 0–3 move, 4–7 stand, 8 is bad, 9 unknown and 10 is not labelled; 11 moves and was never looked at."""
-    tracks = judged([5, 4, -1, np.nan, 3, -2, -3, -4, 9, 9, 9], [1, 1, 0, 0, 1, 0, 0, 0, 1, 1, 1])
+    by_detector = [np.nan, 1, 1, 2, 2, 0, np.nan, 0, 9, 9, 9]
+    tracks = judged([5, 4, -1, np.nan, 3, -2, -3, -4, 9, 9, 9], [1, 1, 0, 0, 1, 0, 0, 0, 1, 1, 1], by_detector)
     labels = TrackLabels(np.array([11, *range(10)]), np.array([1, 1, 1, 1, 1, 0, 0, 0, 0, 2, -1]))
     found = track_detection(tracks, labels)
     assert found[:5] == (5, 4, 4, 2, 1)
     assert (found.precision[0], found.recall[0], found.f1[0]) == pytest.approx((2 / 3, 1 / 2, 4 / 7))
     assert found.auc[0] == pytest.approx((4 + 4 + 3) / 12)  # three movers have a margin
+    assert found.detector_auc[0] == pytest.approx((2 + 2 + 2.5) / 9)
     for value, low, high in found[5:]:
         assert low <= value <= high
     text = track_detection_text(found)
@@ -86,5 +89,6 @@ def test_labels_of_a_simulation_are_its_features():
 
 
 def test_rendered_movers_are_found():
-    found = track_detection(track_verdicts(verdicts(recorded.run().info)), recorded.content().labels)
+    info = recorded.run().info
+    found = track_detection(track_verdicts(verdicts(info), info), recorded.content().labels)
     assert found.num_movers >= 3 and found.num_found >= 3 and found.auc[0] > 0.7

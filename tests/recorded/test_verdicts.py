@@ -19,7 +19,7 @@ from vcjax.recorded.verdicts import VERDICTS, classes, track_verdicts, verdicts
 nan = math.nan
 
 
-def frame_info(ids, verdict, re1, re2, margin, deleted=(), is_finite=True, is_full=False) -> dict:
+def frame_info(ids, verdict, re1, re2, margin, deleted=(), is_finite=True, is_full=False, watched=()) -> dict:
     """What the info of a frame with candidates of given verdicts holds; "" where not measured."""
     word = np.array(verdict)
     return {
@@ -32,6 +32,8 @@ def frame_info(ids, verdict, re1, re2, margin, deleted=(), is_finite=True, is_fu
         "is_dynamic": word == "dynamic",
         "dynamic_margin": np.array(margin, float),
         "inconsistent_id": np.array([*deleted, *[-1] * (2 - len(deleted))], np.int32),
+        "watched_id": np.array([*(i for i, _ in watched), *[-1] * (2 - len(watched))], np.int32),
+        "detector_margin": np.array([*(m for _, m in watched), *[nan] * (2 - len(watched))]),
         "map_is_full": np.array(is_full),
         "is_finite": np.array(is_finite),
     }
@@ -40,8 +42,10 @@ def frame_info(ids, verdict, re1, re2, margin, deleted=(), is_finite=True, is_fu
 @pytest.fixture
 def info(unchecked) -> FrameInfo:
     frames = [
-        frame_info([4, 7, 9], ["accepted", "recovered", ""], [1.0, 12.0, 5.0], [nan, 11.0, nan], [-8.0, -7.0, nan]),
-        frame_info([-1, 9, 7], ["", "dynamic", "accepted"], [nan, 30.0, 2.0], [nan, 4.0, nan], [nan, 17.0, -7.0], [4]),
+        frame_info([4, 7, 9], ["accepted", "recovered", ""], [1.0, 12.0, 5.0], [nan, 11.0, nan], [-8.0, -7.0, nan],
+                   watched=[(4, -3.0), (5, -1.0)]),
+        frame_info([-1, 9, 7], ["", "dynamic", "accepted"], [nan, 30.0, 2.0], [nan, 4.0, nan], [nan, 17.0, -7.0], [4],
+                   watched=[(4, 2.0), (7, nan)]),
         frame_info([7, 3, -1], ["rejected", "accepted", ""], [10, 3, 1], [nan] * 3, [1, -6, nan], [8], True, True),
     ]  # fmt: skip
     # The rest is that of some other run.
@@ -66,7 +70,7 @@ def test_rows_by_frame(info):
 
 
 def test_tracks_and_classes(info):
-    found = track_verdicts(verdicts(info))
+    found = track_verdicts(verdicts(info), info)
     assert found.track_id.tolist() == [3, 4, 7, 8, 9]
     #                                  accepted, recovered, dynamic, rejected, deleted
     assert found.counts.tolist() == [
@@ -77,10 +81,11 @@ def test_tracks_and_classes(info):
         [0, 0, 1, 0, 0],
     ]
     np.testing.assert_array_equal(found.margin, [-6.0, -8.0, 1.0, nan, 17.0])
+    np.testing.assert_array_equal(found.detector_margin, [nan, 2.0, nan, nan, nan])  # 5 has no verdict
     assert found.is_called.tolist() == [False, True, False, True, True]
     kinds = classes(np.array([9, 7, 5, 4, 3, 99]), found)
     assert kinds == ("dynamic", "recovered", "unused", "dynamic", "accepted", "unused")
-    nothing = track_verdicts(type(verdicts(info))(*(column[:0] for column in verdicts(info))))
+    nothing = track_verdicts(type(verdicts(info))(*(column[:0] for column in verdicts(info))), info)
     assert classes(np.array([1]), nothing) == ("unused",)
 
 
@@ -100,7 +105,7 @@ def test_summary_by_hand(info):
     filtered = Filtered(info, LastPlaces(np.array([4, 7]), np.zeros((2, 3)), np.zeros((2, 3, 3))), 12.5, 0.2)
     recording = SimpleNamespace(time_s=np.array([10.0, 10.5, 12.0]), num_frames=3)
     found = run_summary(
-        vc.FilterConfig(gate=vc.VirtualCorrection(th1=9.0)), recording, filtered, track_verdicts(verdicts(info))
+        vc.FilterConfig(gate=vc.VirtualCorrection(th1=9.0)), recording, filtered, track_verdicts(verdicts(info), info)
     )
     assert (found["frames"], found["duration_s"], found["times_real_time"]) == (3, 2.0, pytest.approx(10.0))
     assert [found[name] for name in VERDICTS] == [3, 1, 1, 1, 2]
@@ -111,6 +116,8 @@ def test_summary_by_hand(info):
     assert found["nis_high"] + found["nis_low"] == pytest.approx(2 * mean)
     assert found["beyond_gate_expected"] == pytest.approx(stats.chi2.sf(9.0, 2))
     assert found["first_failure"] is None and found["failures"] == 0
+    assert found["frames_blind"] == 0  # the last accepts 3
+    assert found["end_std_m"] == pytest.approx(np.sqrt(np.trace(recorded.run().info.vehicle_cov[-1, :3, :3])))
     text = run_summary_text(found)
     for words in (
         "0.2 s, 10 times real time; compilation 12.5 s",
@@ -120,7 +127,24 @@ def test_summary_by_hand(info):
         "failures         none",
     ):
         assert words in text
+    assert "scale  " not in text and "cut at" not in text  # of the command alone
+    more = run_summary_text(found | {"scale": "free", "scale_factor": 1.0, "tracks_cut": 7})
+    assert "free: lengths are those of the priors" in more and "cut at 7 sightings" in more
+    assert "from 1 m; lengths are multiplied by 2.5" in run_summary_text(
+        found | {"scale": "known from 1 m", "scale_factor": 2.5}
+    )
     assert "which it is not" not in text and "which it is not" in run_summary_text(found | {"nis": 6.0})
+
+
+def test_nothing_is_expected_of_a_gate_that_accepts_jointly(info):
+    filtered = Filtered(info, LastPlaces(np.array([4, 7]), np.zeros((2, 3)), np.zeros((2, 3, 3))), 12.5, 0.2)
+    recording = SimpleNamespace(time_s=np.array([10.0, 10.5, 12.0]), num_frames=3)
+    config = vc.FilterConfig(gate=vc.OnePointRansac())
+    found = run_summary(config, recording, filtered, track_verdicts(verdicts(info)))
+    assert all(math.isnan(found[name]) for name in ("nis_low", "nis_high", "beyond_gate_expected"))
+    assert found["nis"] == pytest.approx(2.0) and found["beyond_gate"] == pytest.approx(0.5)
+    text = run_summary_text(found)
+    assert "2.000 of the accepted\n" in text and "50.00 % of the measured\n" in text
 
 
 def test_first_failure_is_named(info):

@@ -116,7 +116,7 @@ def test_figures_of_one_scene_have_their_titles_whole(choice):
 
 
 def test_a_descents_figure_names_its_numbers_as_the_landscape_does():
-    steps = [Step({TH1: 9.0 + k, "config.pixel_std_px": 1.0}, 1.0, 0.5, 0.1, {}, {}, 0) for k in range(3)]
+    steps = [Step({TH1: 9.0 + k, "config.pixel_std_px": 1.0}, 1.0, 0.5, 0.1, {}, {}, {}, 0) for k in range(3)]
     titles = [axes.get_title() for axes in descent_figure([steps]).axes]
     assert titles == ["smoothed objective", "Th₁", "pixel_std_px"]
 
@@ -141,8 +141,8 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     }  # fmt: skip
 
     assert "all of these stayed finite" in (tmp_path / "sweep" / "sweep.md").read_text()
-    steps = [Step({TH1: 9.0 + k, TH2: 9.0 - k}, 1.0, 0.5, np.nan, {TH1: 0.1, TH2: 0.2}, {}, k) for k in range(3)]
-    steps.append(Step({TH1: 12.0, TH2: 6.0}, 1.0, np.nan, np.nan, {TH1: np.nan, TH2: np.nan}, {}, 4))
+    steps = [Step({TH1: 9.0 + k, TH2: 9.0 - k}, 1.0, 0.5, np.nan, {TH1: 0.1, TH2: 0.2}, {}, {}, k) for k in range(3)]
+    steps.append(Step({TH1: 12.0, TH2: 6.0}, 1.0, np.nan, np.nan, {TH1: np.nan, TH2: np.nan}, {}, {}, 4))
     left_out = [{TH1: 50.0, TH2: 1.0}]
     tuned = Tuned([steps, steps], choice, 64, left_out)
     paths = write_tuning(tuned, {"thresholds": as_grid(choice)}, tmp_path / "tune")

@@ -1,8 +1,12 @@
 """Sightings that repeat the one before to the last bit."""
 
-import numpy as np
+import dataclasses
 
-from vcjax.sources.repeats import cut_repeats, repeated_frames
+import numpy as np
+import recorded
+
+from vcjax.recording import validate
+from vcjax.sources.repeats import cut_recording, cut_repeats, repeated_frames
 from vcjax.sources.tracks import Tracks
 
 MOVES = np.array([[10.0, 20.0], [11.5, 20.5], [13.0, 21.0], [14.5, 21.5], [16.0, 22.0]])
@@ -37,3 +41,29 @@ def test_frames_that_mostly_repeat():
     np.testing.assert_array_equal(repeated_frames(tracks), [1])
     nothing = Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))
     assert len(repeated_frames(nothing)) == len(cut_repeats(nothing).frame) == 0
+
+
+def test_a_recording_is_cut_in_place():
+    """Columns stay; pieces are told by whose they are, and end where they are cut."""
+    recording = recorded.content().recording
+    frame, column = np.nonzero(recording.is_valid)
+    uv_px = np.array(recording.uv_px)
+    ids = np.array(recording.track_id)
+    # In frame 10 every track that goes on from frame 9 stands still.
+    for c in np.flatnonzero(recording.is_valid[10]):
+        if len(before := np.flatnonzero(recording.is_valid[9] & (ids[9] == ids[10, c]))):
+            uv_px[10, c] = uv_px[9, before[0]]
+    cut = cut_recording(dataclasses.replace(recording, uv_px=uv_px))
+    assert validate(cut.recording) is None and cut.num_cuts > 20
+    np.testing.assert_array_equal(cut.track_of(cut.recording.track_id)[frame, column], ids[frame, column])
+    # Numbered by when they begin, the pieces of old tracks before tracks that are new there.
+    pieces, first = np.unique(cut.recording.track_id[frame, column], return_index=True)
+    assert pieces.tolist() == list(range(len(cut.origin))) and np.all(np.diff(frame[first]) >= 0)
+    begun = cut.origin[frame[first] == 10]
+    assert np.all(np.diff(begun) > 0) and (begun <= ids[:10].max()).sum() == cut.num_cuts
+    going_on = np.isin(ids[9], ids[10][recording.is_valid[10]]) & recording.is_valid[9]
+    assert cut.recording.is_last[9][going_on].all() and cut.track_of(np.array(-1)) == -1
+    same = cut_recording(recording)
+    assert same.num_cuts == 0
+    np.testing.assert_array_equal(same.track_of(same.recording.track_id)[frame, column], ids[frame, column])
+    np.testing.assert_array_equal(same.recording.is_last, recording.is_last)

@@ -23,6 +23,7 @@ from vcjax.sources.tracks import (
     read_times,
     read_tracks,
     recording_from_tracks,
+    start_covariance,
     tracks_of,
     write_tracks,
 )
@@ -238,3 +239,19 @@ def test_real_car(tmp_path):
     true = (np.linalg.inv(T_w_b[0]) @ T_w_b[-1])[:3, 3]
     assert 40 < np.linalg.norm(place - true) < 60
     assert json.loads((tmp_path / "c.json").read_text())["width"] == 1226
+
+
+def test_covariance_of_the_start():
+    """Of the quaternion: that of many draws of a small turn before it."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_euler("zyx", [0.7, -0.3, 1.1])
+    q = turn.as_quat(scalar_first=True)
+    cov = start_covariance(np.array([1.0, 2.0, 3.0, *q]), 0.1, 0.01)
+    drawn = (Rotation.from_rotvec(np.random.default_rng(0).normal(0, 0.01, (200_000, 3))) * turn).as_quat(
+        scalar_first=True
+    )
+    drawn *= np.sign(drawn @ q)[:, None]
+    np.testing.assert_allclose(cov[3:7, 3:7], np.cov(drawn.T), atol=3e-7)
+    np.testing.assert_allclose(cov[:3, :3], 0.01 * np.eye(3))
+    assert not cov[7:].any() and not cov[:3, 3:].any() and np.abs(cov[3:7, 3:7] @ q).max() < 1e-15

@@ -33,6 +33,8 @@ def invented(seed: int = 0) -> xr.Dataset:
         "dynamic_deletions": verdicts,
         "inconsistent_deletions": deletions,
         "first_deleted": np.where(flagged, first + rng.integers(1, 30, size=shape), 0),
+        "velocity_error_m_s": np.where(deletions > 0, rng.random(shape), np.nan),
+        "velocity_nees": np.where(deletions > 0, 3 * rng.random(shape), np.nan),
     }
     runs = runs.assign({name: (("seed", "feature"), values) for name, values in new.items()})
     return runs.assign(is_finite=("seed", is_finite), position_error_m=runs.position_error_m * (1 + 0.1 * seed))
@@ -41,6 +43,7 @@ def invented(seed: int = 0) -> xr.Dataset:
 def test_scores_equal_python_loops():
     runs, static = invented(1), invented(2)
     found, movers, false, mapped, delays = ([] for _ in range(5))
+    velocity_errors, nees = [], []
     for s in range(NUM_SEEDS):
         if s == 2:
             continue
@@ -51,6 +54,9 @@ def test_scores_equal_python_loops():
             if bool(runs.is_moving[f]):
                 counts["movers"] += flagged or int(one.frames_mapped) >= 20
                 counts["found"] += flagged
+                if int(one.inconsistent_deletions) > 0:
+                    velocity_errors.append(float(one.velocity_error_m_s))
+                    nees.append(float(one.velocity_nees) / 3)
                 counts["delay"] += (int(one.first_deleted) - int(one.first_mapped)) if flagged else 0
             elif int(one.frames_mapped) > 0:
                 counts["mapped"] += 1
@@ -67,6 +73,8 @@ def test_scores_equal_python_loops():
     assert score["found_fraction"]["mean"] == pytest.approx(sum(found) / sum(movers))
     assert score["static_flagged_fraction"]["mean"] == pytest.approx(sum(false) / sum(mapped))
     assert score["delay_frames"]["mean"] == pytest.approx(sum(delays) / sum(found))
+    assert score["velocity_error_m_s"]["mean"] == pytest.approx(np.mean(velocity_errors))
+    assert score["velocity_nees"]["mean"] == pytest.approx(np.mean(nees)) and len(nees) < sum(found)
     good = np.arange(NUM_SEEDS) != 2
     rmse, static_rmse = (100 * np.sqrt((r.position_error_m.values[good] ** 2).mean(1)) for r in (runs, static))
     assert score["position_rmse_cm"]["mean"] == pytest.approx(rmse.mean())
@@ -143,5 +151,32 @@ def test_a_scene_knows_its_static_one():
     assert len({Scene(a, m, v).identifier for a in (0.0, 0.05) for m in ("lateral", None) for v in (1.0, 0.25)}) == 8
 
 
-def test_every_method_but_those_of_the_paper_flags_for_good():
-    assert {name for name, config in METHODS.items() if config.blacklist_capacity == 0} == {"VC", "RE"}
+def test_harder_scenes_stand_beside_their_static_ones(tmp_path, monkeypatch):
+    """With the oscillation as badly known there; several sets of movers share theirs."""
+    worked = []
+
+    def monte_carlo(scenario, config, *, first_seed, num_seeds, key, **_):
+        worked.append(scenario)
+        runs = fake_runs(MOVING, num_seeds=num_seeds).assign_coords(seed=first_seed + np.arange(num_seeds))
+        return runs.assign_attrs(attributes(Experiment(scenario, config), key))
+
+    monkeypatch.setattr(reproduce, "monte_carlo", monte_carlo)
+    options = dict(amplitudes_m=(0.1,), motions=("lateral",), speeds_m_s=(1.0,), num_seeds=1, key=jax.random.key(0))
+    runs = detect(
+        tmp_path, ["VC"], dynamic_sets=("ahead", "near_path"), harder_scenes=("turns", "jitter_5_mm"), **options
+    )
+    scenes = [scene for _, scene in runs]
+    assert len(scenes) == len(worked) == 2 + 2 + 3 + 1 and all(scene.static in scenes for scene in scenes)
+    jittery = [s for s in worked if s.oscillation_std_m == 0.005]
+    assert len(jittery) == 2 and {float(s.movers.speed_m_s) for s in jittery} == {0.0, 0.5}
+    assert len({scene.identifier for scene in scenes}) == len(scenes)
+    with pytest.raises(ValueError, match=r"harder_scenes=\('fog',\).*late, stops"):
+        detect(tmp_path, ["VC"], harder_scenes=("fog",), **options)
+
+
+def test_only_methods_with_a_detector_of_their_own_flag_for_good():
+    assert {name for name, config in METHODS.items() if config.blacklist_capacity == 0} == {
+        "VC",
+        "RE",
+        "one_point_ransac",
+    }

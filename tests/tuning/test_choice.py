@@ -222,8 +222,8 @@ def broken_at(*starts: int):
             raise ValueError(f"the objective is not finite at the start, {start}; start elsewhere.")
         nan = dict.fromkeys(start, np.nan)
         steps = list(history) or [
-            descent.Step(dict(start), 1.0, 0.5, np.nan, dict.fromkeys(start, 0.1), {}, 1),
-            descent.Step(dict(start), 0.5, np.nan, np.nan, nan, nan, 2),
+            descent.Step(dict(start), 1.0, 0.5, np.nan, dict.fromkeys(start, 0.1), {}, {}, 1),
+            descent.Step(dict(start), 0.5, np.nan, np.nan, nan, nan, nan, 2),
         ]
         progress(steps)
         return steps

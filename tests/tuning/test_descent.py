@@ -71,24 +71,35 @@ def test_a_step_averages_both_estimates_over_the_pairs_and_goes_down():
         pathwise.append(np.mean(slopes, axis=0))
         of_pairs.append((pair[0] - pair[1]) * shift / (2 * sigma**2))
     assert (step.loss, step.num_failed) == (pytest.approx(np.mean(losses), rel=1e-9), 0)
-    assert step.loss_se == pytest.approx(np.std(losses, ddof=1) / 2, rel=1e-9)
-    weight = 1 / np.var(pathwise, axis=0, ddof=1)
-    weight = weight / (weight + 1 / np.var(of_pairs, axis=0, ddof=1))
+    # Two scenes of two pairs: half the squared difference of the two is a variance, of one degree of freedom each.
+    losses, pathwise, of_pairs = (np.reshape(each, (2, 2, -1)) for each in (losses, pathwise, of_pairs))
+
+    def variance(pairs):
+        return np.mean((pairs[:, 0] - pairs[:, 1]) ** 2 / 2, axis=0)
+
+    assert step.loss_se == pytest.approx(np.sqrt(variance(losses)[0] / 4), rel=1e-9)
+    weight = 1 / variance(pathwise)
+    weight = weight / (weight + 1 / variance(of_pairs))
     np.testing.assert_allclose(list(step.pathwise.values()), weight, rtol=1e-3)
-    expected = weight * np.mean(pathwise, axis=0) + (1 - weight) * np.mean(of_pairs, axis=0)
-    np.testing.assert_allclose(list(step.gradient.values()), expected, rtol=1e-3, atol=1e-5)
+    both = weight * pathwise + (1 - weight) * of_pairs
+    np.testing.assert_allclose(list(step.gradient.values()), both.mean(axis=(0, 1)), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(list(step.gradient_se.values()), np.sqrt(variance(both) / 4), rtol=1e-3)
 
 
-def test_steps_go_down_the_mean_gradient_in_units_of_its_norm():
+def test_steps_go_down_the_gradient_in_units_of_its_errors_and_norm():
     """Against plain NumPy: the first step is as long as the learning rate, later ones remember those before."""
     schedule = dataclasses.replace(ONE_STEP, num_steps=4)
     steps = descend(PROBLEM, START, schedule, key=KEY)
     assert steps[0].parameters == {path: pytest.approx(value) for path, value in START.items()}
     free, momentum = PROBLEM.to_free(START), np.zeros(3)
-    squared = np.sum(np.square(list(steps[0].gradient.values())))
+
+    def sure(step):
+        return np.array(list(step.gradient.values())) / np.array(list(step.gradient_se.values()))
+
+    squared = np.sum(np.square(sure(steps[0])))
     for k, step in enumerate(steps):
         np.testing.assert_allclose(PROBLEM.to_free(step.parameters), free, rtol=1e-7, atol=1e-9)
-        gradient = np.array(list(step.gradient.values()))
+        gradient = sure(step)
         squared = 0.9 * squared + 0.1 * gradient @ gradient
         momentum = 0.5 * momentum + gradient / (np.sqrt(squared) + 1e-6)
         free = free - 0.2 * (0.1 + 0.9 * (1 + np.cos(np.pi * k / 4)) / 2) * momentum
@@ -109,17 +120,18 @@ def test_steps_draw_new_seeds_the_temperature_falls_and_a_stopped_descent_goes_o
 
 def test_the_end_is_the_mean_of_the_last_quarter_in_the_free_numbers():
     free = np.arange(24.0).reshape(8, 3) / 20
-    steps = [module.Step(PROBLEM.to_parameters(x), 1.0, 0.0, 0.0, {}, {}, 0) for x in free]
+    steps = [module.Step(PROBLEM.to_parameters(x), 1.0, 0.0, 0.0, {}, {}, {}, 0) for x in free]
     np.testing.assert_allclose(PROBLEM.to_free(end_of(PROBLEM, steps)), free[6:].mean(axis=0), rtol=1e-9)
 
 
 def broken_after(num_calls: int, monkeypatch):
-    """Runs that went non-finite: all of them after so many calls, one of two pairs before."""
+    """Runs that went non-finite: all of them after so many calls, all but one of four pairs before."""
     calls = []
 
     def run_lanes(*_, **__):
         calls.append(len(calls))
-        runs = {"loss": np.array([1.0, 2.0, np.nan, 3.0]), "gradient": np.ones((4, 3)), "shift": np.ones((4, 3))}
+        losses = np.array([1.0, 2.0, np.nan, 3.0, *(np.nan,) * 4])
+        runs = {"loss": losses, "gradient": np.ones((8, 3)), "shift": np.ones((8, 3))}
         return runs if len(calls) <= num_calls else {name: np.full_like(v, np.nan) for name, v in runs.items()}
 
     monkeypatch.setattr(module, "run_lanes", run_lanes)
@@ -145,9 +157,9 @@ def test_of_many_parameters_the_derivative_is_taken_in_reverse_mode():
 def test_what_goes_non_finite_is_left_out_and_counted(monkeypatch):
     broken_after(1, monkeypatch)
     first, *rest = descend(PROBLEM, START, dataclasses.replace(ONE_STEP, num_steps=3), key=KEY)
-    assert (first.loss, first.num_failed) == (1.5, 1)
+    assert (first.loss, first.num_failed) == (1.5, 3)
     assert list(first.gradient.values()) == [1.0, 1.0, 1.0]  # of a single pair the pathwise one alone
-    assert all(step.num_failed == 2 and np.isnan(step.loss) for step in rest)
+    assert all(step.num_failed == 4 and np.isnan(step.loss) for step in rest)
     assert rest[0].parameters == rest[1].parameters  # no step was taken from there
 
 
@@ -155,7 +167,7 @@ def test_no_step_is_taken_along_a_gradient_that_is_not_finite():
     """Nor does the optimiser remember it."""
     optimiser, free = ONE_STEP.optimiser(), np.array([0.1, -0.2, 0.3])
     state = optimiser.init(jnp.asarray(free))
-    step = module.Step(START, 1.0, 0.5, 0.1, dict.fromkeys(START, 1.0), {}, 0)
+    step = module.Step(START, 1.0, 0.5, 0.1, dict.fromkeys(START, 1.0), dict.fromkeys(START, 0.5), {}, 0)
     moved, moved_state = module._move(optimiser, free, state, step)
     assert np.all(moved < free)
     for gradient in (np.nan, np.inf, -np.inf):

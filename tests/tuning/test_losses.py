@@ -50,6 +50,8 @@ def info(
     return FrameInfo(
         **nothing
         | dict(
+            followers=None,
+            handed_back_id=None,
             vehicle=jnp.asarray(vehicle),
             vehicle_cov=jnp.broadcast_to(variance_m2 * jnp.eye(14), (NUM_FRAMES, 14, 14)),
             candidate_id=jnp.asarray(IDS),

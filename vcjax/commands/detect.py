@@ -8,7 +8,7 @@ from rich.console import Console
 from vcjax.commands.console import numbered_key, progress_bar, say
 from vcjax.devices import Cores
 from vcjax.report.detection_tables import write_detection
-from vcjax.simulation.scenarios import DynamicMotion, DynamicSet
+from vcjax.simulation.scenarios import DynamicMotion, DynamicSet, HarderName
 from vcjax.study.detect import METHODS, detect
 
 
@@ -29,8 +29,10 @@ class Detect:
     """How the movers move."""
     speeds_m_s: tuple[float, ...] = (1.0, 0.5, 0.25)
     """Their speeds, m/s."""
-    dynamic_set: DynamicSet = "ahead"
+    dynamic_sets: tuple[DynamicSet, ...] = ("ahead",)
     """Which features move: the six ahead of the robot, the six near its path, or a bus."""
+    harder_scenes: tuple[HarderName, ...] = ()
+    """Harder scenes beside them: movers that start late, stop or turn, buses, an oscillation known up to 2 or 5 mm."""
     num_frames: int = 160
     """Frames in a run."""
     key: int = 0
@@ -49,7 +51,8 @@ class Detect:
                 amplitudes_m=self.amplitudes_m,
                 motions=self.motions,
                 speeds_m_s=self.speeds_m_s,
-                dynamic_set=self.dynamic_set,
+                dynamic_sets=self.dynamic_sets,
+                harder_scenes=self.harder_scenes,
                 num_frames=self.num_frames,
                 num_seeds=self.seeds,
                 key=numbered_key(self.key),

@@ -19,7 +19,7 @@ from vcjax.study.monte_carlo import monte_carlo
 from vcjax.study.results import describe, save
 from vcjax.study.summary import summarise
 
-GateName = Literal["RE", "VC"]
+GateName = Literal["RE", "VC", "one_point_ransac"]
 DetectorName = Literal[
     "inlier_ratio", "velocity_glr", "velocity_likelihood_ratio", "windowed_nis", "cusum", "immediate"
 ]
@@ -34,7 +34,7 @@ class Simulate:
     config: FilterConfig
     """The filter."""
     gate: GateName = "VC"
-    """Update gate: RE (re-projection error) or VC (virtual correction)."""
+    """Update gate: RE (re-projection error), VC (virtual correction) or 1-point RANSAC with rescue."""
     detector: DetectorName = "inlier_ratio"
     """Which landmarks are deleted over time."""
     seeds: int = 25

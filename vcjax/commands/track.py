@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import tyro
 from rich.console import Console
 
@@ -14,6 +15,7 @@ from vcjax.sources.image_sequence import ImageSequence, record
 from vcjax.sources.odometry import unknown_motion
 from vcjax.sources.overview import summary
 from vcjax.sources.recording_file import save_recording
+from vcjax.sources.tracks import ORIGIN, start_covariance
 from vcjax.storage import check_writable
 
 
@@ -44,6 +46,10 @@ class Track:
     """Every how many-th image."""
     start: Literal["origin", "truth"] = "origin"
     """Where the robot starts: in the origin, or where the truth has it in the first image."""
+    start_std_m: float = 0.0
+    """Standard deviation of that place along each axis, m: above 0 where known points are to correct it."""
+    start_std_deg: float = 0.0
+    """The same of its orientation about each axis, deg."""
     speed_std_m_s: float = 0.5
     """How fast the robot usually goes along each axis, m/s, where there is no odometry."""
     turn_std_rad_s: float = 0.5
@@ -57,6 +63,9 @@ class Track:
         for name, least in (("first", 0), ("step", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} {getattr(self, name)}: give a whole number of at least {least}.")
+        for name in ("start_std_m", "start_std_deg"):
+            if not 0 <= (value := getattr(self, name)) < np.inf:
+                raise ValueError(f"--{name.replace('_', '-')} {value}: a standard deviation is at least 0.")
         if self.last is not None and self.last <= self.first:
             raise ValueError(f"--last {self.last}: give a number above --first {self.first}.")
         sequence = read_sequence(self.folder, self.layout, self.calibration, self.rate_hz, self.camera)
@@ -72,6 +81,9 @@ class Track:
                 odometry,
                 progress=lambda done: show(done, len(sequence)),
                 robot_start=start,
+                start_cov=start_covariance(
+                    np.array(ORIGIN) if start is None else start, self.start_std_m, np.deg2rad(self.start_std_deg)
+                ),
             )
         path = save_recording(self.out, content)
         print(summary(content))

@@ -10,6 +10,7 @@ import equinox as eqx
 import numpy as np
 
 from vcjax.fields import number, require, require_choice, require_count, require_key, require_kind, require_single
+from vcjax.filter.follower import Following
 from vcjax.filter.motion_model import AbstractMotion, Odometry
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.inlier_ratio import InlierRatio
@@ -59,6 +60,9 @@ class FilterConfig(eqx.Module):
     in their first frames end so, and are never found."""
     blacklist_capacity: int = eqx.field(static=True, default=0)
     """How many deleted features are remembered and kept from being born again; 0: a deleted feature may come back."""
+    following: Following = eqx.field(default_factory=Following)
+    """How deleted features are followed outside the map, and handed back when they stand still (see `follower`); needs
+    a blacklist, from which these then come off. None are unless `max_followed` is above 0."""
     skip_free_slots: bool | None = eqx.field(static=True, default=None)
     """Pass over the part of P in use only, by a loop whose length depends on the map: best where runs go one by one, as
     on a CPU. False passes over all of P at once: for runs side by side, as on an accelerator. None: by the default
@@ -123,6 +127,13 @@ class FilterConfig(eqx.Module):
             raise ValueError(
                 f"FilterConfig(update='stacked', smoothing={self.smoothing!r}): stacked corrections have no smooth "
                 "form; take update='sequential'."
+            )
+        followings = "give a Following, e.g. vcjax.Following(max_followed=16)."
+        require_kind("FilterConfig", "following", self.following, Following, followings)
+        if self.following.max_followed > 0 and self.blacklist_capacity == 0:
+            raise ValueError(
+                f"FilterConfig(following=Following(max_followed={self.following.max_followed}), blacklist_capacity=0): "
+                "what is followed must stay out of the map; set blacklist_capacity, e.g. 64."
             )
         if self.max_updates > self.max_landmarks:
             raise ValueError(

@@ -27,6 +27,7 @@ from vcjax.filter.submap import (
     weighted,
     wide,
 )
+from vcjax.gates.gate import Joint
 from vcjax.models.camera import Camera
 from vcjax.models.landmarks import INVERSE_DEPTH
 
@@ -46,6 +47,8 @@ class Innovation(NamedTuple):
     """Predicted inside the image."""
     H_l: Float[Array, "*b 2 7"]
     """The landmark's part of H, by the errors of its slot."""
+    PH_l: Float[Array, "*b 7 2"]
+    """Its rows of P Hᵀ."""
 
 
 class Gain(NamedTuple):
@@ -68,7 +71,22 @@ def innovate(
     HP = H @ block_rows(submap, submap.P, j) - HU @ submap.U
     S = block_columns(submap, HP, j) @ H.T + pixel_cov(config, H.dtype)
     z, is_visible = uv_px - observation.pixel, observation.is_visible
-    return Innovation(observation.pixel, z, S, mahalanobis(z, S), is_visible, H[:, -SLOT:]), Gain(H, HP, HU)
+    PH_l = block_columns(submap, HP, j)[:, -SLOT:].T
+    return Innovation(observation.pixel, z, S, mahalanobis(z, S), is_visible, H[:, -SLOT:], PH_l), Gain(H, HP, HU)
+
+
+def innovate_jointly(
+    config: FilterConfig, camera: Camera, submap: Submap, uv_px: Float[Array, "K 2"], is_measured: Bool[Array, " K"]
+) -> tuple[Innovation, Joint]:
+    """All candidates' innovations at the submap's present state, and how they depend on each other."""
+    everyone = jnp.arange(is_measured.shape[0])
+    innovation, gain = jax.vmap(lambda j, y: innovate(config, camera, submap, j, y))(everyone, uv_px)
+    H = jax.vmap(wide, in_axes=(None, 0, 0))(submap, everyone, gain.H)
+    R = pixel_cov(config, H.dtype)
+    is_pair = (is_measured[:, None] & is_measured)[..., None, None]
+    S = jnp.where(is_pair, jnp.einsum("ian,jbn->ijab", gain.HP, H), 0.0)
+    S = S.at[everyone, everyone].add(R)
+    return innovation, Joint(jnp.where(is_measured[:, None], innovation.z, 0.0), S, R, is_measured)
 
 
 def correct_with(

@@ -11,10 +11,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vcjax.filter.config import FilterConfig
-from vcjax.filter.correction import Innovation, correct_stacked, correct_with, innovate, pixel_cov
+from vcjax.filter.correction import (
+    Innovation,
+    correct_stacked,
+    correct_with,
+    innovate,
+    innovate_jointly,
+    pixel_cov,
+)
 from vcjax.filter.features import measurement_model
 from vcjax.filter.submap import Submap, block, block_cov
-from vcjax.gates.gate import Candidates, Verdict
+from vcjax.gates.gate import AbstractJointGate, Candidates, Verdict
 from vcjax.gates.surrogates import decide, straight_through
 from vcjax.models.camera import Camera
 
@@ -53,16 +60,20 @@ def correct_frame(
     # An unmeasured candidate's pixel may be anything, NaN included; zero keeps derivatives finite.
     uv_px = jnp.where(is_measured[:, None], uv_px, 0.0)
     everyone = jnp.arange(is_measured.shape[0])
-    if gate.prior == "predicted" or config.update == "stacked":
+    innovation = margin = None
+    if isinstance(gate, AbstractJointGate):
+        innovation, joint = innovate_jointly(config, camera, predicted, uv_px, is_measured)
+        margin = gate.margins(joint)
+    elif gate.prior == "predicted" or config.update == "stacked":
         at_prediction = jax.vmap(lambda j, y: innovate(config, camera, predicted, j, y)[0])
         innovation = at_prediction(everyone, uv_px)
         margin = gate.margin(innovation.re1)
-        if config.update == "stacked":
-            submap = correct_stacked(config, camera, submap, uv_px, is_measured & (margin > 0))
-        else:
-            submap, _, _ = _correct_accepted(config, camera, submap, uv_px, is_measured, margin)
-    else:
+    if innovation is None or margin is None:
         submap, innovation, margin = _correct_accepted(config, camera, submap, uv_px, is_measured)
+    elif config.update == "stacked":
+        submap = correct_stacked(config, camera, submap, uv_px, is_measured & (margin > 0))
+    else:
+        submap, _, _ = _correct_accepted(config, camera, submap, uv_px, is_measured, margin)
     is_accepted = is_measured & (margin > 0)
     is_isolated = is_measured & ~is_accepted
     is_judged = is_isolated if config.smoothing == "hard" else is_measured
@@ -85,7 +96,8 @@ def correct_frame(
 
     # In most frames nobody is isolated.
     submap, verdict = jax.lax.cond(jnp.any(is_judged), judge, judge_nobody, submap)
-    is_recovered, is_dynamic = is_isolated & verdict.is_recovered, is_isolated & verdict.is_dynamic
+    is_recovered = is_isolated & verdict.is_recovered
+    is_dynamic = is_isolated & verdict.is_dynamic if gate.condemns else jnp.zeros_like(is_isolated)
     submap = eqx.tree_at(lambda s: s.is_corrected, submap, is_accepted | is_recovered)
     # A gate without verdicts has none to add to the margin by which it leaves out.
     dynamic_margin = jnp.where(is_isolated, jnp.fmin(-margin, verdict.margin), -margin)

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from vcjax.filter.follower import Followers
 from vcjax.filter.landmark_points import LandmarkPoints
 
 
@@ -63,6 +64,11 @@ class FrameInfo(eqx.Module):
     """Landmarks that left the map in this frame, as they were after its corrections: deleted by gate or detector (see
     `is_dynamic`, `inconsistent_id`), or else retired, their feature never being seen again. With them and
     `landmark_points` of the last state the map is whole."""
+    followers: Followers | None
+    """Features followed outside the map at the end of the frame, with velocity, its covariance, and for how long each
+    has stood still; None where none are to be (`FilterConfig.following`)."""
+    handed_back_id: Int[Array, "*T F"] | None
+    """Features that came off the blacklist in this frame, having stood still; -1 elsewhere."""
     track_id: Int[Array, " L"]
     """Feature held by each slot at the end of the frame; -1 where free."""
     num_coordinates: Int[Array, ""]
@@ -75,6 +81,6 @@ class FrameInfo(eqx.Module):
     """Whether the vehicle's mean and covariance are finite numbers."""
 
     @property
-    def is_blind(self) -> Bool[Array, ""]:
+    def is_blind(self) -> Bool[Array, "*T"]:
         """Whether no pixel corrected the state: it follows its motion alone, and its covariance grows."""
         return ~jnp.any(self.is_accepted | self.is_recovered, axis=-1)

@@ -5,6 +5,7 @@ depends on: a camera in a hand has a velocity, odometry a bias. Its numbers are 
 """
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar
 
 import equinox as eqx
@@ -142,6 +143,14 @@ class ConstantVelocity(AbstractMotion):
     def turn(self, carried):
         """The velocity, δθ × v."""
         return jnp.concatenate([-cross_matrix(carried[:3]), jnp.zeros((3, 3), carried.dtype)])
+
+
+MOTIONS: Mapping[str, type[AbstractMotion]] = {
+    "odometry": Odometry,
+    "biased_odometry": BiasedOdometry,
+    "constant_velocity": ConstantVelocity,
+}
+"""The models by name."""
 
 
 def _of_both(linear, angular) -> Float[Array, "6 6"]:

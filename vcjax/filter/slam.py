@@ -2,7 +2,7 @@
 
 One frame, in order: prediction (6) (7); every landmark's pixel predicted; the K most uncertain visible ones chosen;
 formal corrections (8)–(12), the gate's verdict (13) (14), corrections with the recovered; deletion of what gate or
-detector flagged; retirement of what cannot matter any more; births.
+detector flagged, which is then followed outside the map if wanted; retirement of what cannot matter any more; births.
 """
 
 from typing import Any
@@ -16,8 +16,10 @@ from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 from vcjax.fields import require_kind
 from vcjax.filter import landmark_map
 from vcjax.filter.config import FilterConfig, check_arguments
+from vcjax.filter.correction import pixel_cov
 from vcjax.filter.evidence import evidence_of
 from vcjax.filter.features import choose, match, predict_features
+from vcjax.filter.following import follow
 from vcjax.filter.frame_corrections import correct_frame
 from vcjax.filter.info import FrameInfo
 from vcjax.filter.known_landmarks import KnownLandmarks, check_known, place_known
@@ -98,7 +100,8 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         jnp.where(is_measured, innovation.is_visible, prediction.is_visible[slot])
     )
     is_watched = state.is_mapped & ~is_dynamic
-    evidence = evidence_of(submap, outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, frame.time_step_s)
+    R = pixel_cov(config, innovation.S.dtype)
+    evidence = evidence_of(outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, R, frame.time_step_s)
     detector, margin = config.detector.observe(_of_mapped(config, state), evidence)
     margin = jnp.where(is_watched, margin, jnp.nan).astype(state.P_vv.dtype)
     is_flagged = margin > 0
@@ -127,6 +130,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     is_deleted = is_dynamic | is_flagged
     before = state
     state = landmark_map.delete(landmark_map.ban(config, state, is_deleted), is_deleted)
+    state, info_of_candidates["handed_back_id"] = follow(config, before, state, is_deleted, frame)
     if config.retire:
         state = landmark_map.retire(config, state, prediction.is_near)
     info_of_candidates["departed"] = landmark_points(before, ~state.is_mapped)
@@ -217,6 +221,9 @@ def start(
         detector_margin=jnp.full(L, jnp.nan, dtype),
         p_detector=jnp.zeros(L, dtype),
         inconsistent_id=jnp.full(L, FREE, jnp.int32),
+        handed_back_id=jnp.full(config.following.max_followed, FREE, jnp.int32)
+        if config.following.max_followed
+        else None,
     )
     info_of_candidates["departed"] = landmark_points(state, jnp.zeros_like(state.is_mapped))
     is_mapped = jnp.zeros_like(frame.is_valid) if known is None else jnp.isin(frame.track_id, known.track_id)
@@ -240,6 +247,7 @@ def _finish(
         carried=state.vehicle[VEHICLE:],
         carried_std=jnp.sqrt(jnp.diagonal(state.P_vv)[VEHICLE:]),
         born_id=jnp.full(attempts, FREE, born.dtype).at[:num_births].set(born),
+        followers=state.followers,
         track_id=state.track_id,
         num_coordinates=len(state.vehicle)
         + jnp.sum(jnp.where(state.is_mapped, jnp.where(state.is_euclidean, 3, SLOT), 0)),

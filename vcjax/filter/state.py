@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.follower import Followers, nobody
 from vcjax.filter.map_covariance import SLOT, SLOTS_PER_BLOCK, slot_blocks, symmetric
 from vcjax.models.frames import unit
 from vcjax.recording import Recording
@@ -59,6 +60,8 @@ class FilterState(eqx.Module):
     """Deleted features that must not be born again, newest first; -1 where empty."""
     blacklist_left: Float[Array, " B"]
     """For how many frames more; meaningless where empty."""
+    followers: Followers | None
+    """Deleted features that are followed outside the map; None where none are to be."""
     key: PRNGKeyArray | None
     """Key of the random birth order; None where births go by id."""
 
@@ -118,6 +121,7 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
         detector=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_slots, *leaf.shape)), config.detector.born()),
         blacklist=jnp.full(config.blacklist_capacity, FREE, jnp.int32),
         blacklist_left=jnp.zeros(config.blacklist_capacity, dtype),
+        followers=nobody(config.following, dtype) if config.following.max_followed else None,
         key=key,
     )
 

@@ -32,3 +32,8 @@ class Either(AbstractDetector):
         first, first_margin = self.first.observe(state[0], evidence)
         second, second_margin = self.second.observe(state[1], evidence)
         return (first, second), jnp.fmax(first_margin, second_margin)
+
+    def velocity(self, state: PyTree) -> tuple[Float[Array, "*L 3"], Float[Array, "*L 3 3"]] | None:
+        """That of the first that estimates one."""
+        first = self.first.velocity(state[0])
+        return self.second.velocity(state[1]) if first is None else first

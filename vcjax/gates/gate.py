@@ -12,13 +12,15 @@ candidate must neither change a result nor a gradient.
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+SLOT = 7
+"""Error coordinates of a slot."""
 Prior = Literal["corrected", "predicted"]
 PRIORS = ("corrected", "predicted")
 
@@ -99,6 +101,8 @@ class AbstractGate(eqx.Module):
     """Where isolated candidates are judged: "corrected", after all formal corrections of the frame, with RE₁ < Th₁
     tested at the running state; or "predicted", with both at the state after prediction, as equation (13) is
     printed."""
+    condemns: ClassVar[bool] = True
+    """Whether what it judges and does not recover is dynamic, its landmark deleted at once; or only left out."""
 
     @abstractmethod
     def margin(self, re1: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -118,6 +122,30 @@ class AbstractGate(eqx.Module):
         """
 
 
+class Joint(NamedTuple):
+    """The innovations of a frame's K candidates at the predicted state, and their joint covariance."""
+
+    z: Float[Array, "K 2"]
+    """y - ê, px (8); 0 where not measured."""
+    S: Float[Array, "K K 2 2"]
+    """S_ij = H_i P H_jᵀ, and R where i = j (9), px². What is not measured has R, and depends on nothing."""
+    R: Float[Array, "2 2"]
+    """Pixel noise covariance, px²."""
+    is_measured: Bool[Array, " K"]
+    """Which candidates were found in the image."""
+
+
+class AbstractJointGate(AbstractGate):
+    """Update gate that accepts by all innovations of a frame together, at the predicted state.
+
+    Its `margin` says of one measurement alone whether it may be accepted at all.
+    """
+
+    @abstractmethod
+    def margins(self, joint: Joint) -> Float[Array, " K"]:
+        """By how much each candidate is accepted, in χ² units: where above 0. Anything where not measured."""
+
+
 class Evidence(eqx.Module):
     """What a frame showed of the landmarks: K candidates, L slots."""
 
@@ -126,7 +154,7 @@ class Evidence(eqx.Module):
     is_searched: Bool[Array, " K"]
     """Chosen for update in this frame. The rest is false or meaningless where this is false."""
     is_measured: Bool[Array, " K"]
-    """Found in the image. The numbers below are meaningless where this is false, but for weight and gain, zero."""
+    """Found in the image. The numbers below are meaningless where this is false, but for the weight, zero."""
     is_corrected: Bool[Array, " K"]
     """Used in a formal correction, accepted or recovered."""
     weight: Float[Array, " K"]
@@ -137,9 +165,10 @@ class Evidence(eqx.Module):
     """S, its covariance, px². Equation (9)."""
     H: Float[Array, "K 2 7"]
     """Derivative of the pixel by the landmark's part of the state, in its slot's error coordinates."""
-    gain: Float[Array, "K 7 2"]
-    """The landmark's own rows of the gain, weighted: what the frame's corrections moved its slot by, per px of its
-    innovation; zero where it was not used."""
+    PH: Float[Array, "K 7 2"]
+    """The landmark's own rows of P Hᵀ as gated, whether it was used or not: times S⁻¹ its own rows of the gain."""
+    pixel_cov: Float[Array, "2 2"]
+    """R, of the noise of a pixel, px²."""
     re1: Float[Array, " K"]
     """RE₁ as gated (13)."""
     dynamic_margin: Float[Array, " K"]
@@ -198,3 +227,7 @@ class AbstractDetector(eqx.Module):
         A margin says by how much, in χ² units, what was seen exceeds what a static landmark may show; NaN where nothing
         can be said. What it decides is smoothed, or not, by `surrogates`.
         """
+
+    def velocity(self, state: PyTree) -> tuple[Float[Array, "*L 3"], Float[Array, "*L 3 3"]] | None:
+        """Estimated velocity of each slot's landmark, m/s, and its covariance, m²/s²; None: it estimates none."""
+        return None

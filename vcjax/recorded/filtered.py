@@ -17,8 +17,9 @@ from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.info import FrameInfo
 from vcjax.filter.known_landmarks import KnownLandmarks
 from vcjax.filter.landmark_points import LandmarkPoints, landmark_points
-from vcjax.filter.stretches import run_in_stretches
-from vcjax.recording import PER_FRAME, Recording
+from vcjax.filter.stretches import STRETCH, run_in_stretches
+from vcjax.recorded.unfinished import Unfinished, first_frames
+from vcjax.recording import Recording
 
 
 class LastPlaces(NamedTuple):
@@ -51,6 +52,9 @@ def filter_recording(
     recording: Recording,
     progress: Callable[[int, int], None] | None = None,
     known: KnownLandmarks | None = None,
+    *,
+    unfinished: Unfinished | None = None,
+    length: int = STRETCH,
 ) -> Filtered:
     """Filter a whole recording, however long.
 
@@ -59,40 +63,57 @@ def filter_recording(
         recording: T frames.
         progress: called with (frames done, T), now and then.
         known: landmarks that are in the map from the start.
+        unfinished: where work is kept that takes long, and where the same run goes on if it was stopped; of this
+            configuration and recording. It stays until whoever asked removes it.
+        length: most frames in a stretch; work is written between two of them.
 
     Returns: infos as `vcjax.run` gives them, the map, and the time that it took.
 
     Raises:
-        ValueError: for a recording that no filter can run on, or a configuration that needs a key.
+        ValueError: for a recording that no filter can run on, a configuration that needs a key, or unfinished work of
+            another run.
     """
     check_arguments("filter_recording", config, None)
     if config.birth_order == "random":
         raise ValueError("filter_recording(birth_order='random'): births of recordings go by id; take 'lowest_id'.")
-    stretches = run_in_stretches(config, recording, known=known)  # refuses what cannot be run
+    run_in_stretches(config, recording, known=known, length=length)  # refuses what cannot be run
+    begun = None if unfinished is None else unfinished.read()
     begin = time.perf_counter()
-    for _ in run_in_stretches(config, _first_two(recording), known=known):
+    for _ in run_in_stretches(config, first_frames(recording, 2), known=known, length=length):
         pass
     compiled = time.perf_counter()
 
-    infos, last, state = [], _LastPlaces(), None
-    for stretch in stretches:
+    infos, last, state, next_frame, before_s = [], _LastPlaces(), None, 0, 0.0
+    if begun is not None:
+        next_frame, before_s, state, _ = begun
+        for info in begun.infos:
+            last.note(info.departed)
+            infos.append(_without_departed(info))
+    unsaved, saved = [], compiled
+    going_on = {"length": length, "state": state, "next_frame": next_frame}
+    for stretch in run_in_stretches(config, recording, known=known, **going_on):
         last.note(stretch.info.departed)
-        infos.append(eqx.tree_at(lambda info: info.departed, stretch.info, None))
+        infos.append(_without_departed(stretch.info))
         if progress is not None:
             progress(stretch.next_frame, recording.num_frames)
         state = stretch.state
+        if unfinished is not None:
+            unsaved.append(stretch)
+            now, is_done = time.perf_counter(), stretch.next_frame == recording.num_frames
+            if now - (compiled if is_done else saved) >= unfinished.every_s:
+                done_s = before_s + now - compiled
+                unfinished.write(unsaved[0].first_frame, _joined([s.info for s in unsaved]), state, done_s)
+                unsaved, saved = [], time.perf_counter()
     last.note(_points(state))
-    info = jax.tree.map(lambda *leaves: np.concatenate(leaves), *infos)
-    return Filtered(info, last.known(), compiled - begin, time.perf_counter() - compiled)
+    return Filtered(_joined(infos), last.known(), compiled - begin, before_s + time.perf_counter() - compiled)
 
 
-def _first_two(recording: Recording) -> Recording:
-    """The first frames of a recording: enough to compile all that the others need."""
+def _without_departed(info: FrameInfo) -> FrameInfo:
+    return eqx.tree_at(lambda info: info.departed, info, None)
 
-    def of_frames(recording):
-        return [getattr(recording, name) for name in PER_FRAME]
 
-    return eqx.tree_at(of_frames, recording, [leaf[:2] for leaf in of_frames(recording)])
+def _joined(infos: list[FrameInfo]) -> FrameInfo:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *infos)
 
 
 @jax.jit

@@ -6,10 +6,10 @@
 | `camera_tum.txt`, `camera_kitti.txt` | poses T_w_c of the camera |
 | `landmarks.ply`, `landmarks.csv` | every landmark's last place, class and covariance; see `map_file.py` |
 | `verdicts.csv` | frame, track_id, re1, re2, margin, verdict: a row for each measured candidate and each deletion |
-| `tracks.csv` | how often each verdict was passed on each track, and its largest margin |
+| `tracks.csv` | how often each verdict was passed on each track, its largest margin and the detector's |
 | `summary.json` | the numbers of `run_summary`, and what they come from; written last |
 
-Tables are CSV or Parquet. In columns re1, re2 and margin nan stands where there was no such number.
+Tables are CSV or Parquet. In columns re1, re2 and of margins nan stands where there was no such number.
 """
 
 import contextlib
@@ -33,6 +33,7 @@ from vcjax.storage import filling, write_file
 
 TableFormat = Literal["csv", "parquet"]
 TABLES, ENDINGS = ("landmarks", "verdicts", "tracks"), ("csv", "parquet")
+_MARGINS = ("margin", "detector_margin")
 _MAX_JSON_BYTES = 2**24
 _SUMMARY = "summary.json"
 _STALE = ("features/[0-9]*.png", "features.gif", "features.mp4", *(f"{t}.{e}" for t in TABLES for e in ENDINGS))
@@ -108,7 +109,8 @@ def new_run(
         columns: dict[str, Any] = passed._asdict() | {"verdict": np.array(VERDICTS)[passed.verdict]}
         write_table(new / f"verdicts.{table}", columns)
         columns = {"track_id": tracks.track_id} | dict(zip(VERDICTS, tracks.counts.T, strict=True))
-        write_table(new / f"tracks.{table}", columns | {"margin": tracks.margin})
+        margins = {name: getattr(tracks, name) for name in _MARGINS}
+        write_table(new / f"tracks.{table}", columns | margins)
         yield new
         shown = {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in summary.items()}
         write_file(new / _SUMMARY, f"{json.dumps(shown, indent=1)}\n".encode())
@@ -134,11 +136,15 @@ def read_run(folder: str | os.PathLike) -> RunFolder:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: no summary of a run ({error}).") from error
     time_s, robot = read_tum(folder / "robot_tum.txt")
-    kinds: dict[str, Kind] = {"track_id": "whole", **dict.fromkeys(VERDICTS, "whole"), "margin": "real"}
+    kinds: dict[str, Kind] = {
+        "track_id": "whole",
+        **dict.fromkeys(VERDICTS, "whole"),
+        **dict.fromkeys(_MARGINS, "real"),
+    }
     paths = [folder / f"tracks.{ending}" for ending in ENDINGS]
-    found = read_table(next((path for path in paths if path.is_file()), paths[0]), kinds, undefined=["margin"])
+    found = read_table(next((path for path in paths if path.is_file()), paths[0]), kinds, undefined=_MARGINS)
     for name in ("track_id", *VERDICTS):
         found.refuse_where(found[name] < 0, name, "is below 0")
     found.refuse_where(np.diff(found["track_id"], prepend=-1) <= 0, "track_id", "is not above the one before")
     counts = np.column_stack([found[name] for name in VERDICTS])
-    return RunFolder(time_s, robot, TrackVerdicts(found["track_id"], counts, found["margin"]), summary)
+    return RunFolder(time_s, robot, TrackVerdicts(found["track_id"], counts, *(found[n] for n in _MARGINS)), summary)

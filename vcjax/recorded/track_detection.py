@@ -40,6 +40,8 @@ class TrackDetection(NamedTuple):
     """2 found / (found + false + movers)."""
     auc: Interval
     """Area under the ROC of the tracks' largest margin."""
+    detector_auc: Interval
+    """The same of the detector's margin."""
 
 
 def labels_of(content: RecordingFile) -> TrackLabels | None:
@@ -62,15 +64,17 @@ def track_detection(tracks: TrackVerdicts, labels: TrackLabels) -> TrackDetectio
     label = dict(zip(np.asarray(labels.track_id).tolist(), np.asarray(labels.label).tolist(), strict=True))
     told = np.array([label.get(i, int(TrackLabel.UNKNOWN)) for i in tracks.track_id.tolist()], int)
     is_mover, is_scored = told == TrackLabel.MOVING, np.isin(told, [TrackLabel.MOVING, TrackLabel.STATIC])
-    is_mover, is_called, margin = (x[is_scored] for x in (is_mover, tracks.is_called, tracks.margin))
+    is_mover, is_called = is_mover[is_scored], tracks.is_called[is_scored]
     # One track to a "seed", so that the resamples are over tracks.
-    scored = roc.Tracks(margin[:, None], is_mover[:, None])
+    margins = tracks.margin, tracks.detector_margin
+    by_gate, by_detector = (roc.Tracks(margin[is_scored, None], is_mover[:, None]) for margin in margins)
 
     def figures(weights: np.ndarray) -> np.ndarray:
         found, called, movers = weights @ (is_called & is_mover), weights @ is_called, weights @ is_mover
         with np.errstate(invalid="ignore", divide="ignore"):
             f1 = np.where(movers > 0, 2 * found / (called + movers), np.nan)
-            return np.stack([found / called, found / movers, f1, roc.area(scored, weights)])
+            areas = [roc.area(scored, weights) for scored in (by_gate, by_detector)]
+            return np.stack([found / called, found / movers, f1, *areas])
 
     found = figures(np.ones((1, len(is_mover))))[:, 0]
     drawn = [figures(weights) for weights in _resamples(is_mover)]
@@ -111,7 +115,13 @@ def track_detection_text(found: TrackDetection) -> str:
         ("movers", f"{found.num_found} found of {found.num_movers} judged ({found.num_movers_labelled} labelled)"),
         ("static", f"{found.num_false} called dynamic or deleted of {found.num_static} judged"),
     ]
-    for name, label in (("precision", "precision"), ("recall", "recall"), ("f1", "F1"), ("auc", "AUC")):
+    for name, label in (
+        ("precision", "precision"),
+        ("recall", "recall"),
+        ("f1", "F1"),
+        ("auc", "AUC, gate"),
+        ("detector_auc", "AUC, detector"),
+    ):
         value, low, high = getattr(found, name)
         rows.append((label, _interval(value, low, high)))
     return "\n".join(f"{name:26s} {text}" for name, text in rows)

@@ -40,6 +40,8 @@ class TrackVerdicts(NamedTuple):
     """How often each of `VERDICTS` was passed."""
     margin: Float[np.ndarray, " L"]
     """The largest of all frames: a score by which tracks can be ranked; NaN where never measured."""
+    detector_margin: Float[np.ndarray, " L"]
+    """The same of the detector's; NaN where it never had anything to say."""
 
     @property
     def is_called(self) -> Bool[np.ndarray, " L"]:
@@ -71,14 +73,23 @@ def verdicts(info: FrameInfo) -> Verdicts:
     return Verdicts(*(column[order] for column in columns))
 
 
-def track_verdicts(passed: Verdicts) -> TrackVerdicts:
-    """The verdicts of each track."""
+def track_verdicts(passed: Verdicts, info: FrameInfo) -> TrackVerdicts:
+    """The verdicts of each track.
+
+    Args:
+        passed: all verdicts.
+        info: of every frame, leading axis T.
+    """
     ids, track = np.unique(passed.track_id, return_inverse=True)
     counts = np.zeros((len(ids), len(VERDICTS)), np.int64)
     np.add.at(counts, (track, passed.verdict), 1)
-    margin = np.full(len(ids), -np.inf)
+    margin, by_detector = np.full((2, len(ids)), -np.inf)
     np.fmax.at(margin, track, passed.margin)
-    return TrackVerdicts(ids, counts, np.where(np.isneginf(margin), np.nan, margin))
+    watched, said = np.asarray(info.watched_id), np.asarray(info.detector_margin, np.float64)
+    is_said = np.isfinite(said) & np.isin(watched, ids)
+    np.fmax.at(by_detector, np.searchsorted(ids, watched[is_said]), said[is_said])
+    margin, by_detector = (np.where(np.isneginf(x), np.nan, x) for x in (margin, by_detector))
+    return TrackVerdicts(ids, counts, margin, by_detector)
 
 
 def classes(track_id: Int[np.ndarray, " M"], tracks: TrackVerdicts) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vcjax.report.detection_prediction import prediction_figure, prediction_markdown, predictions
 from vcjax.report.markup import grid
 from vcjax.report.style import RC, new_figure, write_figure
 from vcjax.storage import write_file, write_json
@@ -27,6 +28,7 @@ _HEADER = (
     "movers found, %",
     "static flagged, %",
     "delay, frames",
+    "velocity error, m/s",
     "position, cm",
     "against the static scene, cm",
     "ratio",
@@ -35,7 +37,8 @@ _HEADER = (
 _INTRODUCTION = f"""\
 *Movers found*: unique movers flagged of those in the map for at least {MIN_FRAMES_MAPPED} frames or flagged, features
 of all runs pooled, and how many; *static flagged*: static features ever flagged of those ever mapped; *delay*: frames
-from first birth to first deletion of the movers found; *position*: RMS error of a run; *against the static scene*: the
+from first birth to first deletion of the movers found; *velocity error*: |v̂ − v| of movers when they were flagged, of
+methods that estimate it, and in brackets its NEES / 3; *position*: RMS error of a run; *against the static scene*: the
 difference of it from the same seeds without movers, with its 95 % interval, bold where that excludes zero; *ratio*: of
 the two errors; *ANEES*: of the position, 1 of a consistent filter. ± is a standard error over runs, which is 0 where
 all runs agree. The features that are flagged are those that gate or detector has ever deleted.
@@ -51,10 +54,11 @@ def detection_tables(runs: Runs) -> dict[str, Any]:
     Returns: `cells` with movers and `static_cells` without, each with `detector`, `robot_motion`, `dynamic_motion`,
         `dynamic_speed_m_s`, `amplitude_m` and the `study.detect.scores`. Those with movers have the static scene's
         `static_scene_position_rmse_cm`, and `difference`: by figure of `DIFFERENCES` the `mean` of scene - static scene
-        of the same seeds, its 95 % interval `lower` to `upper` and `num_pairs`. Beside them `methods`, the
+        of the same seeds, its 95 % interval `lower` to `upper` and `num_pairs`. `harder_cells` are like them, with the
+        harder scene's name as `label`. Beside them `methods`, the
         configuration of each, and `num_seeds`.
     """
-    cells, static_cells = [], []
+    cells, harder_cells, static_cells, predicted = [], [], [], predictions(runs)
     for (method, scene), found in runs.items():
         static = runs[method, scene.static]
         cell: dict[str, Any] = {
@@ -65,26 +69,31 @@ def detection_tables(runs: Runs) -> dict[str, Any]:
             "amplitude_m": scene.amplitude_m,
             "label": scene.label,
         }
-        if scene.dynamic_motion is None:
+        if scene.is_static:
             cell |= scores(found, found)
             static_cells.append(cell)
             continue
+        if scene.dynamic_motion is not None:
+            cell["dynamic_set"] = scene.dynamic_set
         cell |= scores(found, static)
         cell["static_scene_position_rmse_cm"] = scores(static, static)["position_rmse_cm"]
         cell["difference"] = _difference(found, static)
-        cells.append(cell)
+        if (method, scene) in predicted:
+            cell["predicted"] = predicted[method, scene]
+        (cells if scene.harder is None else harder_cells).append(cell)
     return {
         "num_seeds": max(int(found.sizes["seed"]) for found in runs.values()),
         "min_frames_mapped": MIN_FRAMES_MAPPED,
         "methods": {name: describe(METHODS[name]) for name in dict.fromkeys(method for method, _ in runs)},
         "cells": cells,
+        "harder_cells": harder_cells,
         "static_cells": static_cells,
     }
 
 
 def detection_markdown(tables: Mapping[str, Any]) -> str:
     """The same as Markdown: a table for each amplitude, the methods of a scene below each other."""
-    every = [*tables["cells"], *tables["static_cells"]]
+    every = [*tables["cells"], *tables["harder_cells"], *tables["static_cells"]]
     failed, full = (sum(cell[name] for cell in every) for name in ("runs_failed", "runs_map_full"))
     num_runs = sum(cell["runs"] for cell in every)
     counts = f"{tables['num_seeds']} runs of each method in each scene; of {num_runs} runs {failed} failed"
@@ -94,6 +103,8 @@ def detection_markdown(tables: Mapping[str, Any]) -> str:
         cells = [cell for cell in every if cell["amplitude_m"] == amplitude]
         scenes = dict.fromkeys(cell["label"] for cell in cells)
         sections.append(grid(_HEADER, [_row(cell) for scene in scenes for cell in cells if cell["label"] == scene]))
+    if predicted := [cell for cell in every if "predicted" in cell]:
+        sections += ["## Predicted before anything was run\n", prediction_markdown(predicted)]
     return "\n".join(sections)
 
 
@@ -108,13 +119,22 @@ def write_detection(runs: Runs, directory: Path) -> list[Path]:
     tables = detection_tables(runs)
     paths = [write_json(directory / "detect.json", tables)]
     paths.append(write_file(directory / "detect.md", detection_markdown(tables).encode()))
-    paths += write_figure(found_figure(tables), directory / "figures" / "movers_found")
-    return paths + write_figure(position_figure(tables), directory / "figures" / "position")
+    for dynamic_set in dict.fromkeys(cell["dynamic_set"] for cell in tables["cells"]):
+        chosen = [cell for cell in tables["cells"] if cell["dynamic_set"] == dynamic_set]
+        name = "" if dynamic_set == "ahead" else f"_{dynamic_set}"
+        paths += write_figure(found_figure(tables | {"cells": chosen}), directory / "figures" / f"movers_found{name}")
+        paths += write_figure(position_figure(tables | {"cells": chosen}), directory / "figures" / f"position{name}")
+    if predicted := [cell for cell in [*tables["cells"], *tables["harder_cells"]] if "predicted" in cell]:
+        paths += write_figure(prediction_figure(predicted), directory / "figures" / "predicted")
+    return paths
 
 
 @matplotlib.rc_context(RC)
-def found_figure(tables: Mapping[str, Any]) -> Figure:
-    """Share of the movers found over their speed, a panel for each motion and amplitude; bars are ± standard errors."""
+def found_figure(tables: dict[str, Any]) -> Figure:
+    """Share of the movers found over their speed, a panel for each motion and amplitude; bars are ± standard errors.
+
+    Of the cells of one set of movers.
+    """
 
     def draw(axes: Axes, speeds: np.ndarray, cells: list[dict[str, Any]], style: dict[str, Any]) -> None:
         mean, error = (np.array([100 * cell["found_fraction"][part] for cell in cells]) for part in ("mean", "se"))
@@ -125,7 +145,7 @@ def found_figure(tables: Mapping[str, Any]) -> Figure:
 
 
 @matplotlib.rc_context(RC)
-def position_figure(tables: Mapping[str, Any]) -> Figure:
+def position_figure(tables: dict[str, Any]) -> Figure:
     """What movers add to the position error, over their speed; bars are 95 % intervals, paired by seed."""
 
     def draw(axes: Axes, speeds: np.ndarray, cells: list[dict[str, Any]], style: dict[str, Any]) -> None:
@@ -195,6 +215,7 @@ def _row(cell: Mapping[str, Any]) -> list[str]:
         found,
         _text(cell["static_flagged_fraction"], 2, 100),
         _text(cell["delay_frames"], 1),
+        _velocity(cell),
         _text(cell["position_rmse_cm"], 2),
         "–" if difference is None else _interval(difference),
         "–" if difference is None else _text(cell["position_ratio"], 2),
@@ -208,6 +229,12 @@ def _text(figure: Mapping[str, float], decimals: int, factor: float = 1.0) -> st
     if not math.isfinite(mean):
         return "–"
     return f"{mean:.{decimals}f}" + (f" ± {error:.{decimals}f}" if math.isfinite(error) else "")
+
+
+def _velocity(cell: Mapping[str, Any]) -> str:
+    if not math.isfinite(cell["velocity_error_m_s"]["mean"]):
+        return "–"
+    return f"{_text(cell['velocity_error_m_s'], 2)} ({cell['velocity_nees']['mean']:.2f})"
 
 
 def _interval(difference: Mapping[str, float]) -> str:

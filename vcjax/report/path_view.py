@@ -17,6 +17,7 @@ _MOST_ROOM = 4.0
 _WELL_KNOWN = 0.2
 """Largest standard deviation of a landmark that the view reaches for, as a part of its distance from the middle."""
 _MOST_ELLIPSES = 400
+"""Of each class."""
 
 
 @matplotlib.rc_context(RC)
@@ -83,7 +84,8 @@ def _ellipses(axes, landmarks: LandmarkMap, chosen: np.ndarray, colour, extent_m
     """2 σ ellipses of (x, y), of the landmarks that are known better than a part of the view."""
     values, vectors = np.linalg.eigh(landmarks.cov[chosen][:, :2, :2])
     size = 4.0 * np.sqrt(np.maximum(values, 0.0))
-    for place, axis, (short, long) in list(zip(landmarks.place_m[chosen], vectors, size, strict=True))[:_MOST_ELLIPSES]:
+    every = max(1, -(-len(values) // _MOST_ELLIPSES))  # spread over the run
+    for place, axis, (short, long) in list(zip(landmarks.place_m[chosen], vectors, size, strict=True))[::every]:
         if long < 0.15 * extent_m:
             angle = np.rad2deg(np.arctan2(axis[1, 1], axis[0, 1]))
             axes.add_patch(Ellipse(place[:2], long, short, angle=angle, fill=False, edgecolor=colour, linewidth=0.5))

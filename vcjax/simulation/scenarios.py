@@ -209,6 +209,19 @@ def paper(
     )
 
 
+HarderName = Literal[
+    "late",
+    "stops",
+    "stops_and_starts",
+    "turns",
+    "drawn",
+    "bus_3",
+    "bus_12",
+    "bus_24",
+    "bus_48",
+    "jitter_2_mm",
+    "jitter_5_mm",
+]
 HARDER: dict[str, dict[str, Any]] = {
     "late": {"dynamic_course": "late"},
     "stops": {"dynamic_course": "stops"},

@@ -4,14 +4,16 @@ from typing import Any
 
 import numpy as np
 
-from vcjax.recording import Recording
+from vcjax.recording import Recording, moves_in_frame
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, TrackLabel
+from vcjax.sources.repeats import repeated_frames
 from vcjax.sources.tracks import tracks_of
+from vcjax.sources.warnings import warnings
 
 
 def summary(content: Recording | RecordingFile) -> str:
-    """A recording in words: frames, rate, tracks and their lengths, features per frame, calibration, odometry, truth.
+    """A recording in words: frames, tracks and their lengths, calibration, odometry, truth; and what to be warned of.
 
     Args:
         content: a recording, alone or with what is known beside it.
@@ -50,12 +52,14 @@ def summary(content: Recording | RecordingFile) -> str:
     else:
         known = int(np.sum(np.all(np.isfinite(np.asarray(truth.robot)), axis=1)))
         num, moving = np.shape(truth.is_moving)[0], int(np.sum(truth.is_moving))
-        rows.append(("truth", f"poses of {known} frames" + (f", {num} features, {moving} move" if num else "")))
+        when = f" (in {int(np.any(moves_in_frame(truth), axis=1).sum())} frames)" if moving else ""
+        rows.append(("truth", f"poses of {known} frames" + (f", {num} features, {moving} move{when}" if num else "")))
     if labels is not None:
         counts = [f"{np.sum(labels.label == label)} {label.name.lower()}" for label in TrackLabel]
         rows.append(("labels", ", ".join(counts)))
     if image_paths is not None:
         rows.append(("image files", f"{image_paths[0]} … {image_paths[-1]}"))
+    rows += [("warning", text) for text in warnings(recording)]
     return "\n".join(f"{name:15s} {text}" for name, text in rows)
 
 
@@ -85,6 +89,9 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     (seen, lengths), (image, path) = figure.subplots(2, 2)
 
     seen.plot(time_s, np.sum(np.asarray(recording.is_valid), axis=1), color=_BLUE)
+    if len(repeated := repeated_frames(tracks)):
+        seen.plot(time_s[repeated], np.zeros(len(repeated)), "|", color=_RED, markersize=12, label="most tracks repeat")
+        seen.legend(loc="lower right", fontsize=8)
     seen.set(xlabel="time (s)", ylabel="features seen", title="Features in each frame", ylim=(0, None))
     if len(length):
         bins = np.unique(np.rint(np.geomspace(1, length.max() + 1, 30))) - 0.5  # whole numbers in each

@@ -12,10 +12,30 @@ done unasked.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Int
 
+from vcjax.recording import Recording, last_sightings
 from vcjax.sources.tracks import Tracks
+
+
+class CutRecording(NamedTuple):
+    """A recording whose tracks are cut where they repeat."""
+
+    recording: Recording
+    """Its tracks are the pieces, numbered by the frame in which they begin, and of those that begin together the one
+    of the oldest track first: births by id take what has been followed for long before what is new."""
+    origin: Int[np.ndarray, " C"]
+    """Track that each piece is of."""
+    num_cuts: int
+
+    def track_of(self, piece: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+        """Which track each piece belongs to; -1, nobody, stays."""
+        piece = np.asarray(piece)
+        if not len(self.origin):
+            return piece
+        return np.where(piece >= 0, self.origin[piece.clip(0, len(self.origin) - 1)], -1).astype(piece.dtype)
 
 
 class _Sorted(NamedTuple):
@@ -62,6 +82,23 @@ def cut_repeats(tracks: Tracks) -> Tracks:
     cut = track_id.astype(np.int64)
     cut[order] = np.where(piece > piece_of_start, ids[piece], track_id[order])
     return tracks._replace(track_id=cut)
+
+
+def cut_recording(recording: Recording) -> CutRecording:
+    """A recording with its tracks cut by `cut_repeats`, and which piece is whose. Pixels stay where they are."""
+    is_valid, track_id = np.asarray(recording.is_valid), np.asarray(recording.track_id)
+    frame, column = np.nonzero(is_valid)
+    ids, uv_px = track_id[is_valid].astype(np.int64), np.asarray(recording.uv_px, np.float64)[is_valid]
+    cut = cut_repeats(Tracks(frame, ids, uv_px)).track_id
+    pieces, first, piece = np.unique(cut, return_index=True, return_inverse=True)
+    order = np.lexsort((ids[first], frame[first]))
+    rank = np.empty(len(order), track_id.dtype)
+    rank[order] = np.arange(len(order))
+    renamed = np.zeros_like(track_id)
+    renamed[frame, column] = rank[piece]
+    changed = renamed, last_sightings(renamed, is_valid)
+    whole = eqx.tree_at(lambda r: (r.track_id, r.is_last), recording, changed)
+    return CutRecording(whole, ids[first][order], len(pieces) - len(np.unique(ids)))
 
 
 def _sorted(tracks: Tracks) -> _Sorted:

@@ -159,6 +159,20 @@ def recording_from_tracks(
     return recording
 
 
+def start_covariance(robot_start: Float[np.ndarray, "7"], std_m: float, std_rad: float) -> Float[np.ndarray, "14 14"]:
+    """Covariance of a start that is known up to these standard deviations, of robot and sensor pose.
+
+    That of the quaternion is G Gᵀ σ², with G the derivative of ½ (0, θ) ⊗ q by a small turn θ. The sensor's pose is
+    certain.
+    """
+    w, x, y, z = np.asarray(robot_start, np.float64)[3:]
+    G = 0.5 * np.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
+    cov = np.zeros((14, 14))
+    cov[:3, :3] = std_m**2 * np.eye(3)
+    cov[3:7, 3:7] = std_rad**2 * G @ G.T
+    return cov
+
+
 def tracks_of(recording: Recording, calibration: Calibration | None = None) -> Tracks:
     """The sightings in a recording, by frame and identity: the inverse of `recording_from_tracks`.
 

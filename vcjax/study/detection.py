@@ -24,8 +24,8 @@ def detections(info: FrameInfo, truth: Truth) -> dict[str, Array]:
         "dynamic_deletions": _count_by_feature(dynamic_id, num_features),
         "inconsistent_deletions": _count_by_feature(info.inconsistent_id, num_features),
         "frames_mapped": _count_by_feature(info.track_id, num_features),
-        "first_mapped": _first_frame(info.track_id, num_features),
-        "first_deleted": _first_frame(deleted_id, num_features),
+        "first_mapped": first_frame(info.track_id, num_features),
+        "first_deleted": first_frame(deleted_id, num_features),
         "dynamic_margin": margin,
         "detector_margin": detector_margin,
         "detection_auc": area_under_roc(margin, is_moving),
@@ -61,7 +61,7 @@ def _count_by_feature(ids: Int[Array, "T n"], num_features: int) -> Int[Array, "
     return jnp.zeros(num_features, jnp.int32).at[_places(ids, num_features)].add(1, mode="drop")
 
 
-def _first_frame(ids: Int[Array, "T n"], num_features: int) -> Int[Array, " F"]:
+def first_frame(ids: Int[Array, "T n"], num_features: int) -> Int[Array, " F"]:
     """First frame, from 1, in which each feature is among the ids; 0 where in none."""
     num_frames = ids.shape[0]
     frame = jnp.broadcast_to(jnp.arange(1, num_frames + 1, dtype=jnp.int32)[:, None], ids.shape).ravel()

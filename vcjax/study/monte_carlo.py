@@ -29,6 +29,7 @@ from vcjax.simulation.simulate import simulate
 from vcjax.study.metrics import run_metrics
 from vcjax.study.results import as_dataset, import_xarray
 from vcjax.study.sweep import Experiment, Sweep, check_sweep, replace_at
+from vcjax.study.velocity_error import velocity_errors
 
 Work = Callable[[dict[str, Array], PRNGKeyArray], dict[str, Array]]
 LANES_PER_CALL = 64
@@ -187,7 +188,13 @@ def _run_point(experiment: Experiment, swept: dict[str, Array], key: PRNGKeyArra
 
 def run_one(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Array]:
     """One run: simulate, filter, compare with the truth. Pure; the function to differentiate or to batch otherwise."""
-    return run_metrics(*simulate_and_filter(experiment, key))
+    return metrics_of(experiment, *simulate_and_filter(experiment, key))
+
+
+def metrics_of(experiment: Experiment, info: FrameInfo, truth: Truth) -> dict[str, Array]:
+    """All that is kept of a run, under the names of the results."""
+    rate = experiment.scenario.frame_rate_hz
+    return run_metrics(info, truth) | velocity_errors(experiment.config.detector, info, truth, rate)
 
 
 def simulate_and_filter(experiment: Experiment, key: PRNGKeyArray) -> tuple[FrameInfo, Truth]:

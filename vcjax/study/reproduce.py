@@ -24,6 +24,7 @@ from vcjax.gates.cusum import Cusum
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.immediate import Immediate
 from vcjax.gates.inlier_ratio import InlierRatio
+from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.velocity_glr import VelocityGLR
 from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio
@@ -39,8 +40,12 @@ from vcjax.study.sweep import Experiment
 SEEDS_PER_BLOCK = 25
 OSCILLATION_AMPLITUDE_M = 0.05
 """A of the paper's oscillating camera (Table 1)."""
-GATES: Mapping[str, Callable[[], AbstractGate]] = {"RE": ReprojectionError, "VC": VirtualCorrection}
-"""The gates by their names in the paper."""
+GATES: Mapping[str, Callable[[], AbstractGate]] = {
+    "RE": ReprojectionError,
+    "VC": VirtualCorrection,
+    "one_point_ransac": OnePointRansac,
+}
+"""The gates by name; the paper has the first two."""
 DETECTORS: Mapping[str, Callable[[], AbstractDetector]] = {
     "inlier_ratio": InlierRatio,
     "velocity_glr": VelocityGLR,

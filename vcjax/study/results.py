@@ -24,7 +24,7 @@ from vcjax.simulation.simulate import simulate
 from vcjax.storage import replacing
 from vcjax.study.sweep import Experiment
 
-SCHEMA = 3
+SCHEMA = 4
 """Version of the layout of results, raised when an older reader would misread them."""
 
 PER_FRAME = {
@@ -50,6 +50,8 @@ PER_FEATURE = {
     "first_deleted": "first frame it was deleted by gate or detector; 0: never",
     "dynamic_margin": "how dynamic it ever looked to the gate, χ² units; NaN: never a measured candidate",
     "detector_margin": "how dynamic it ever looked to the detector, χ² units; NaN: it never had anything to say",
+    "velocity_error_m_s": "error of the detector's velocity when it first deleted a feature, m/s; NaN: it never did",
+    "velocity_nees": "the same, normalised and squared, 3 degrees of freedom",
 }
 PER_RUN = {
     "is_finite": "whether all numbers of the run stayed finite",

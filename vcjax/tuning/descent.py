@@ -1,9 +1,11 @@
 """Going down a smoothed objective by gradient, averaged over scenes and fresh seeds.
 
 Each parameter lives in an interval and is moved as a free number x (see `intervals`). A step averages the objective and
-its gradient over a mini-batch of seeds, new in every step, and over all scenes, and goes down it by NovoGrad: momentum,
-in units of the gradient's norm. (Adam has a unit for each parameter, and moves one that hardly matters by its noise as
-far as the others.) The temperature of the smoothing falls from step to step.
+its gradient over a mini-batch of seeds, new in every step, and over all scenes. What is followed is the gradient in
+units of its standard errors, (∂L/∂xᵢ)/sᵢ: not how much a parameter matters, but how sure it is which way it has to go,
+so that one whose gradient is mostly noise neither hides the others nor is moved far. It is gone down by NovoGrad:
+momentum, in units of the norm. (Adam has a unit for each parameter, and moves one of which nothing is known by its
+noise as far as the others.) The temperature of the smoothing falls from step to step.
 
 The derivative of one long run need not say where the mean of many goes: a run's phase of oscillation depends on f times
 its whole length, and its loss ripples with f over less than a tenth of a hertz, steeply. So what is made small is the
@@ -14,8 +16,8 @@ estimates:
     of the pair     (L(x + ε) - L(x - ε)) ε / 2σ²             sharp where they ripple, as with f
 
 Both come from the same pair of runs of one seed. Each parameter takes their mean weighted by the inverse of their
-variances over the mini-batch. What a soft filter says of a setting is not what the hard filter does with it: `choice`
-looks at that.
+variances over the mini-batch, within the scenes. What a soft filter says of a setting is not what the hard filter does
+with it: `choice` looks at that.
 
 References:
     Ginsburg et al. 2019, "Stochastic gradient methods with layer-wise adaptive moments for training of deep networks".
@@ -41,6 +43,8 @@ from vcjax.tuning.problem import Problem
 
 _MEMORY = (0.5, 0.9)
 """Decay rates of the optimiser's momentum and of its scale: there are a dozen steps and not thousands."""
+_SUREST = 1e-3
+"""Smallest standard error that is believed, as a part of a derivative."""
 
 
 class Schedule(eqx.Module):
@@ -83,9 +87,11 @@ class Step(NamedTuple):
     loss: float
     """Mean of the smoothed objective over the runs that stayed finite."""
     loss_se: float
-    """Its standard error over runs."""
+    """Its standard error over the runs of these scenes; NaN of a single pair."""
     gradient: dict[str, float]
     """By the free numbers."""
+    gradient_se: dict[str, float]
+    """Its standard errors; NaN of a single pair."""
     pathwise: dict[str, float]
     """Weight of the pathwise estimate in it, 0 to 1; the rest is that of the pairs."""
     num_failed: int
@@ -131,7 +137,7 @@ def descend(
         temperature = schedule.temperature(k)
         work = Partial(_value_and_gradient, problem, jnp.asarray(free), jnp.asarray(spread), jnp.asarray(temperature))
         runs = run_lanes(work, lanes, seeds, jax.random.fold_in(key, k))
-        step = _average(runs, problem.to_parameters(free), temperature, spread)
+        step = _average(runs, lanes["scene"][::2], problem.to_parameters(free), temperature, spread)
         if not history and not np.isfinite(step.loss):
             raise ValueError(f"the objective is not finite at the start, {step.parameters}; start elsewhere.")
         history.append(step)
@@ -152,10 +158,12 @@ def end_of(problem: Problem, history: Sequence[Step]) -> dict[str, float]:
 
 
 def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any, step: Step) -> tuple[np.ndarray, Any]:
-    """One step of the optimiser; none where loss or gradient is not finite."""
-    if not np.all(np.isfinite([step.loss, *step.gradient.values()])):
+    """One step along the gradient in units of its errors; none where loss or gradient is not finite."""
+    gradient, error = (np.array(list(each.values())) for each in (step.gradient, step.gradient_se))
+    if not np.all(np.isfinite([step.loss, *gradient])):
         return free, state
-    update, state = optimiser.update(jnp.asarray(list(step.gradient.values())), state, jnp.asarray(free))
+    sure = gradient / np.maximum(error, _SUREST * np.abs(gradient) + np.finfo(float).tiny)
+    update, state = optimiser.update(jnp.asarray(sure if np.all(np.isfinite(error)) else gradient), state, free)
     return free + np.asarray(update), state
 
 
@@ -187,27 +195,36 @@ def _value_and_gradient(
     return {"loss": value, "gradient": gradient, "shift": shift}
 
 
-def _average(runs: dict[str, np.ndarray], parameters: dict[str, float], temperature: float, spread: np.ndarray) -> Step:
-    """Mean over the pairs that stayed finite, of both estimates of the gradient."""
+def _average(
+    runs: dict[str, np.ndarray],
+    scenes: np.ndarray,
+    parameters: dict[str, float],
+    temperature: float,
+    spread: np.ndarray,
+) -> Step:
+    """Mean over the pairs that stayed finite, each of one scene, of both estimates of the gradient."""
     loss, gradient, shift = (runs[name].reshape(-1, 2, *runs[name].shape[1:]) for name in ("loss", "gradient", "shift"))
     is_finite = np.all(np.isfinite(loss), axis=1) & np.all(np.isfinite(gradient), axis=(1, 2))
-    loss, gradient, shift = loss[is_finite], gradient[is_finite], shift[is_finite, 0]
-    num = len(loss)
-    estimates = np.stack([gradient.mean(axis=1), (loss[:, 0] - loss[:, 1])[:, None] * shift / (2 * spread**2)])
-    if num > 1:
-        precision = 1.0 / np.maximum(estimates.var(axis=1, ddof=1), np.finfo(float).tiny)
-        weight = precision[0] / precision.sum(axis=0)
-        mean = weight * estimates[0].mean(axis=0) + (1.0 - weight) * estimates[1].mean(axis=0)
+    loss, gradient, shift, scenes = loss[is_finite], gradient[is_finite], shift[is_finite, 0], scenes[is_finite]
+    pathwise, of_pair = gradient.mean(axis=1), (loss[:, 0] - loss[:, 1])[:, None] * shift / (2 * spread**2)
+    precision = 1.0 / np.maximum([_variance(each, scenes) for each in (pathwise, of_pair)], np.finfo(float).tiny)
+    # A single pair says nothing of variances.
+    weight = precision[0] / precision.sum(axis=0) if len(loss) > 1 else np.ones(len(parameters))
+    both = weight * pathwise + (1.0 - weight) * of_pair
+    figures = np.column_stack([loss.mean(axis=1), both])
+    if len(figures):
+        mean, error = figures.mean(axis=0), np.sqrt(_variance(figures, scenes) / len(figures))
     else:
-        weight = np.ones(len(parameters))
-        mean = estimates[0, 0] if num else np.full(len(parameters), np.nan)
-    of_pairs = loss.mean(axis=1)
-    return Step(
-        parameters,
-        temperature,
-        float(of_pairs.mean()) if num else np.nan,
-        float(of_pairs.std(ddof=1) / np.sqrt(num)) if num > 1 else np.nan,
-        dict(zip(parameters, mean.tolist(), strict=True)),
-        dict(zip(parameters, weight.tolist(), strict=True)),
-        int((~is_finite).sum()),
-    )
+        mean = error = np.full(1 + len(parameters), np.nan)
+    by_parameter = (dict(zip(parameters, each.tolist(), strict=True)) for each in (mean[1:], error[1:], weight))
+    return Step(parameters, temperature, float(mean[0]), float(error[0]), *by_parameter, int((~is_finite).sum()))
+
+
+def _variance(values: np.ndarray, scenes: np.ndarray) -> np.ndarray:
+    """Variance of pairs within their scenes; over all where no scene has two, NaN of a single pair."""
+    if len(values) < 2:
+        return np.full(values.shape[1:], np.nan)
+    groups = [values[scenes == scene] for scene in np.unique(scenes)]
+    groups = [values] if len(groups) == len(values) else groups
+    squares = [np.sum((group - group.mean(axis=0)) ** 2, axis=0) for group in groups]
+    return np.sum(squares, axis=0) / (len(values) - len(groups))

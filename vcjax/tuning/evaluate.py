@@ -20,8 +20,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.storage import remove_leftovers
 from vcjax.study import roc
-from vcjax.study.metrics import run_metrics
-from vcjax.study.monte_carlo import run_lanes, simulate_and_filter
+from vcjax.study.monte_carlo import metrics_of, run_lanes, simulate_and_filter
 from vcjax.study.results import (
     PER_FEATURE,
     PER_FRAME,
@@ -199,4 +198,4 @@ def _run_lane(scenes: Scenario, config: FilterConfig, objective: Objective, lane
     info, truth = simulate_and_filter(experiment, key)
     scenario = experiment.scenario
     costs = {"loss": objective(scenario, info, truth), "camera_motion_m2_s2": camera_motion_m2_s2(scenario)}
-    return run_metrics(info, truth) | costs
+    return metrics_of(experiment, info, truth) | costs

@@ -1,0 +1,68 @@
+"""What whoever runs a filter over a recording should know of it first: frames that repeat, jumps in time, blind frames.
+
+None of it breaks a run. It tells where the estimate is weak, or where the front end rather than the filter is at fault.
+"""
+
+import numpy as np
+from jaxtyping import Int
+
+from vcjax.recording import Recording
+from vcjax.sources.repeats import repeated_frames
+from vcjax.sources.tracks import tracks_of
+
+JUMP = 1.5
+"""A time step this many times the median, or more, is a jump: at least one frame in between was dropped."""
+_MOST_NAMED = 5
+
+
+def time_jumps(recording: Recording) -> Int[np.ndarray, " J"]:
+    """Frames before which time jumps."""
+    step = np.diff(np.asarray(recording.time_s, np.float64))
+    return np.flatnonzero(step >= JUMP * np.median(step)) + 1 if len(step) else np.zeros(0, int)
+
+
+def empty_frames(recording: Recording) -> Int[np.ndarray, " E"]:
+    """Frames without any feature."""
+    return np.flatnonzero(~np.any(np.asarray(recording.is_valid), axis=1))
+
+
+def unfollowed_frames(recording: Recording) -> Int[np.ndarray, " U"]:
+    """Frames with features, after frames with features, in which no track goes on: nothing links the two images."""
+    is_valid, track_id = np.asarray(recording.is_valid), np.asarray(recording.track_id)
+    found = [
+        t
+        for t in range(1, len(is_valid))
+        if is_valid[t].any()
+        and is_valid[t - 1].any()
+        and not np.isin(track_id[t][is_valid[t]], track_id[t - 1][is_valid[t - 1]]).any()
+    ]
+    return np.array(found, int)
+
+
+def warnings(recording: Recording) -> list[str]:
+    """A line for each thing to be warned of."""
+    found = []
+    repeated = repeated_frames(tracks_of(recording))
+    if len(repeated):
+        found.append(
+            f"{_frames(repeated)}: most tracks repeat the frame before to the last bit. If the camera did not stand "
+            "still there, run with --cut-repeats"
+        )
+    jumps = time_jumps(recording)
+    if len(jumps):
+        found.append(f"time jumps before {_frames(jumps)}, by {JUMP} times the usual step or more")
+    if len(empty := empty_frames(recording)):
+        found.append(f"{_frames(empty)}: no feature is seen")
+    if len(unfollowed := unfollowed_frames(recording)):
+        found.append(f"{_frames(unfollowed)}: no track goes on from the frame before")
+    if not np.any(np.asarray(recording.odometry)):
+        found.append("no odometry: run with --motion constant_velocity; the scale is free unless a length is known")
+    return found
+
+
+def _frames(numbers: Int[np.ndarray, " N"]) -> str:
+    """Some frames by number, and how many there are."""
+    if len(numbers) == 1:
+        return f"frame {numbers[0]}"
+    more = ", …" if len(numbers) > _MOST_NAMED else ""
+    return f"{len(numbers)} frames ({', '.join(map(str, numbers[:_MOST_NAMED]))}{more})"
