@@ -47,7 +47,7 @@ class Study:
     """Pairs of runs of each scene in a step."""
     choosing_seeds: int = 16
     """Runs of each scene that choose among the ends of the descents."""
-    held_out_seeds: int = 50
+    held_out_seeds: int = 100
     """Runs of each scene that compare the choice with before."""
     out: Path = Path("results/tune_oscillation")
     """Folder of the results. Work that was stopped goes on there."""

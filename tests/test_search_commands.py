@@ -14,7 +14,7 @@ from vcjax.tuning.scenes import Scenes
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
 SCENES = ["--num-frames", "8", "--motions", "lateral", "--speeds-m-s", "1", "0.5", "--held-out-seeds", "3"]
-TUNE = [*SCENES, "--num-steps", "2", "--pairs-per-step", "1", "--choosing-seeds", "2", "--landscape-points", "2"]
+TUNE = [*SCENES, "--num-steps", "2", "--pairs-per-step", "1", "--choosing-seeds", "2", "--landscape-points", "3"]
 SWEEP = [*SCENES, "--x-points", "2", "--y-points", "3", "--seeds", "2"]
 
 
@@ -34,6 +34,8 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     assert content["before"]["parameters"]["scenario.oscillation.amplitude_m"] == 0.05
     assert all(step["parameters"]["scenario.oscillation.amplitude_m"] < 0.1 for step in content["history"][1])
     assert len(content["before"]["parameters"]) == 4
+    assert content["steps_skipped"] == content["pairs_failed"] == 0 and content["starts_left_out"] == []
+    assert "All 4 steps were taken, each with all of its runs." in printed
     assert "| lateral, 0.5 m/s |" in printed and printed.strip() in (folder / "tune.md").read_text()
     for name in ("descent", "curves", "roc_by_scene", "landscape_thresholds", "landscape_oscillation"):
         assert f"wrote {folder / 'figures' / name}.png" in told and (folder / "figures" / f"{name}.png").is_file()
@@ -43,8 +45,21 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     before = (folder / "tune.json").read_bytes()
     assert main(arguments) == 0 and (folder / "tune.json").read_bytes() == before
     said(capsys)
-    assert main([*arguments, "--learning-rate", "0.1"]) == 1
-    assert_one_line(said(capsys)[1], "other settings (schedule: ", "give another directory")
+
+    # What is of other settings is refused before any work, as far as that can be known then.
+    for changed, *words in (
+        (["--learning-rate", "0.1"], "start_0.json", "other settings (schedule: ", "give another directory"),
+        (["--choosing-seeds", "3"], "candidates", "other settings (num_seeds: 2, now 3)"),
+        (["--held-out-seeds", "4"], "held_out", "other settings (num_seeds: 3, now 4)"),
+        (["--landscape-points", "4"], "landscape_thresholds", "another number of settings than"),
+        (["--starts", "3"], "candidates", "another number of settings than"),
+    ):
+        assert main([*arguments, *changed]) == 1
+        assert_one_line(said(capsys)[1], *words)
+    for path in (folder / "descents").iterdir():
+        path.unlink()  # the steps were lost: what they led to is found beside them
+    assert main([*arguments, "--position", "3"]) == 1
+    assert_one_line(said(capsys)[1], "candidates", "other settings (objective: ")
 
 
 def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
@@ -64,17 +79,32 @@ def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["tune", "oscillation", "--max-amplitude-m", "2"], ["from 0 to 2", "between 0 and 0.5 m"]),
-        (["tune", "oscillation", "--frequency-band-hz", "1", "7"], ["high=7", "below half the frame rate, 5 Hz"]),
-        (["tune", "oscillation", "--frequency-band-hz", "4", "2"], ["high=2", "above low=4"]),
-        (["tune", "oscillation", "--amplitude-m", "0.2"], ["amplitude_m", "0.2 is not inside"]),
+        (["tune", "oscillation", "--max-amplitude-m", "2"], ["--max-amplitude-m 2", "up to 0.5 m"]),
+        (["tune", "joint", "--max-amplitude-m", "0"], ["--max-amplitude-m 0", "above 0"]),
+        (
+            ["tune", "oscillation", "--frequency-band-hz", "1", "7"],
+            ["--frequency-band-hz 1 7", "below half the frame rate, 5 Hz"],
+        ),
+        (["tune", "oscillation", "--frequency-band-hz", "1", "5"], ["--frequency-band-hz 1 5", "below half"]),
+        (["tune", "oscillation", "--frequency-band-hz", "-1", "4"], ["--frequency-band-hz -1 4", "from 0"]),
+        (["tune", "oscillation", "--frequency-band-hz", "4", "2"], ["--frequency-band-hz 4 2", "rising"]),
+        (["tune", "oscillation", "--frequency-band-hz", "nan", "2"], ["--frequency-band-hz nan 2"]),
+        (["tune", "oscillation", "--amplitude-m", "0.2"], ["--amplitude-m 0.2", "below 0.15", "--max-amplitude-m"]),
+        (["tune", "oscillation", "--amplitude-m", "0"], ["--amplitude-m 0", "above 0 and"]),
+        (["tune", "joint", "--frequency-hz", "4.5"], ["--frequency-hz 4.5", "below 4.5", "--frequency-band-hz"]),
+        (["tune", "thresholds", "--th1", "200"], ["--th1 200", "above 1 and below 100"]),
+        (["tune", "thresholds", "--th2", "0.1"], ["--th2 0.1", "above 0.1 and below 100"]),
+        (["tune", "thresholds", "--track-f1", "0", "--position", "0", "--camera-motion", "0"], ["all weights are 0"]),
+        (["tune", "thresholds", "--position", "inf"], ["position=inf", "finite"]),
+        (["tune", "thresholds", "--mover-weight", "0"], ["mover_weight=0", "positive"]),
+        (["tune", "thresholds", "--speeds-m-s", "0.5", "0.5"], ["speeds_m_s=(0.5, 0.5)", "each once"]),
         (["tune", "thresholds", "--held-out-seeds", "0"], ["held_out=0", "at least 1"]),
         (["tune", "thresholds", "--choosing-seeds", "0"], ["choosing=0", "at least 1"]),
         (["tune", "thresholds", "--starts", "0"], ["num_starts=0"]),
         (["tune", "thresholds", "--num-steps", "0"], ["num_steps=0"]),
         (["tune", "thresholds", "--th1", "-3"], ["th1=-3"]),
         (["tune", "thresholds", "--track-f1", "-1"], ["track_f1=-1"]),
-        (["tune", "thresholds", "--landscape-points", "1"], ["--landscape-points 1", "at least 2"]),
+        (["tune", "thresholds", "--landscape-points", "1"], ["--landscape-points 1", "at least 3"]),
         (["tune", "thresholds", "--frequency-hz", "6"], ["not below half the frame rate"]),
         (["sweep", "--x", "config.gate.th3"], ["no numeric leaf 'config.gate.th3'"]),
         (["sweep", "--x", "config.gate.th2"], ["two numbers", "config.gate.th2"]),
@@ -96,6 +126,23 @@ def test_bad_input_gets_one_line_before_any_work(arguments, words, tmp_path, cap
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
 
 
+@pytest.mark.parametrize("command", ["tune", "sweep"])
+@pytest.mark.parametrize("place", ["", "candidates", "held_out", "figures", "{}.json/x", "{}.md/x"])
+def test_a_place_that_cannot_be_written_to_is_refused_before_any_work(command, place, tmp_path, capsys, monkeypatch):
+    """A file where a directory is needed, or a directory where a file is."""
+    monkeypatch.setattr(descent, "run_lanes", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr(evaluate, "run_lanes", lambda *_: pytest.fail("worked"))
+    arguments = ["tune", "thresholds", *TUNE] if command == "tune" else ["sweep", *SWEEP]
+    folder = tmp_path / "out" / "thresholds" if command == "tune" else tmp_path / "out"
+    bad = folder / place.format(command)
+    bad.parent.mkdir(parents=True, exist_ok=True)
+    bad.write_text("mine")
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 1
+    named = bad.parent if bad.name == "x" else bad
+    assert_one_line(said(capsys)[1], str(named), "is a directory" if bad.name == "x" else "is a file")
+    assert bad.read_text() == "mine"
+
+
 def test_scenes_are_every_motion_at_every_speed(unchecked):
     scenes = Scenes(speeds_m_s=(1.0, 0.5), amplitude_m=0.02, frequency_hz=2.0).make()
     assert list(scenes) == [f"{motion}, {v} m/s" for motion in ("lateral", "inverse forward") for v in ("1", "0.5")]
@@ -103,5 +150,14 @@ def test_scenes_are_every_motion_at_every_speed(unchecked):
         assert tuple(scenario.movers.direction) == ((0, 1, 0) if name.startswith("lateral") else (-1, 0, 0))
         assert scenario.movers.speed_m_s == float(name.split()[-2])
         assert (scenario.oscillation.amplitude_m, scenario.oscillation.frequency_hz) == (0.02, 2.0)
-    with pytest.raises(ValueError, match="at least one each"):
-        Scenes(motions=()).make()
+    near = Scenes(motions=("lateral",), speeds_m_s=(0.5, 0.50000001, 2)).make()
+    assert list(near) == ["lateral, 0.5 m/s", "lateral, 0.50000001 m/s", "lateral, 2 m/s"]
+    for scenes, message in (
+        (Scenes(motions=()), r"motions=\(\)\): give at least one, in a tuple"),
+        (Scenes(speeds_m_s=(1.0, 0.5, 1)), r"speeds_m_s=\(1.0, 0.5, 1\)\): .* each once"),
+        (Scenes(motions=("lateral", "lateral")), "motions=.* each once"),
+        (Scenes(motions="lateral"), r"motions='lateral'\): give at least one, in a tuple"),
+        (Scenes(speeds_m_s=0.5), r"speeds_m_s=0.5\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            scenes.make()

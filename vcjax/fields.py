@@ -83,9 +83,17 @@ def require_count(owner: object, name: str, minimum: int) -> None:
     Raises:
         ValueError: naming class, field, value and remedy.
     """
-    value = getattr(owner, name)
+    require_whole(type(owner).__name__, name, getattr(owner, name), minimum)
+
+
+def require_whole(owner: str, name: str, value: object, minimum: int) -> None:
+    """Refuse an argument that is no whole number, or below a minimum; truth values are none.
+
+    Raises:
+        ValueError: naming owner, name, value and remedy.
+    """
     if not isinstance(value, Integral) or isinstance(value, bool) or value < minimum:
-        raise ValueError(f"{type(owner).__name__}({name}={value!r}): give a whole number of at least {minimum}.")
+        raise ValueError(f"{owner}({name}={_shown(value)}): give a whole number of at least {minimum}.")
 
 
 def require_choice(owner: object, name: str, choices: Sequence[str | bool | None]) -> None:
@@ -99,14 +107,14 @@ def require_choice(owner: object, name: str, choices: Sequence[str | bool | None
         raise ValueError(f"{type(owner).__name__}({name}={value!r}): choose one of {tuple(choices)}.")
 
 
-def require_kind(owner: str, name: str, value: object, kind: type, remedy: str) -> None:
+def require_kind(owner: str, name: str, value: object, kind: type | tuple[type, ...], remedy: str) -> None:
     """Refuse an argument or field that is of another class than is needed.
 
     Args:
         owner: the function or class it is given to.
         name: its name there.
         value: what was given.
-        kind: the class it must be of.
+        kind: the class it must be of, or the classes of which it must be one.
         remedy: what to give instead.
 
     Raises:

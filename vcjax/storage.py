@@ -2,12 +2,15 @@
 
 import contextlib
 import glob
+import json
+import math
 import os
 import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 LEFTOVER_AGE_S = 600.0
 """No write is silent for so long."""
@@ -103,6 +106,24 @@ def write_file(path: str | os.PathLike, content: bytes) -> Path:
     with replacing(path) as temporary:
         temporary.write_bytes(content)
     return Path(path)
+
+
+def write_json(path: str | os.PathLike, content: Any) -> Path:
+    """Write plain values as JSON, complete or not at all, with null for numbers that JSON does not know.
+
+    Raises:
+        OSError: if the place cannot be written; what was there before stays.
+    """
+    return write_file(path, f"{json.dumps(with_nulls(content), indent=1)}\n".encode())
+
+
+def with_nulls(value: Any) -> Any:
+    """Plain values, with null for numbers that JSON does not know."""
+    if isinstance(value, dict):
+        return {key: with_nulls(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [with_nulls(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def check_writable(path: str | os.PathLike) -> None:

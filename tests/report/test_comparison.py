@@ -8,6 +8,8 @@ import xarray as xr
 from scipy import stats
 
 from vcjax.report.comparison import comparison, comparison_markdown
+from vcjax.report.descent import descent_figure
+from vcjax.report.detection_curves import curves_figure, roc_by_scene_figure
 from vcjax.report.landscape import PANELS, landscape_figure
 from vcjax.report.tuning import write_search, write_tuning
 from vcjax.tuning.choice import ALL, COMPARED, RECALL, Choice
@@ -36,7 +38,7 @@ def invented(settings: list[tuple[float, float]], num_seeds: int) -> xr.Dataset:
         | {
             "is_finite": (dims, np.ones(shape, bool)),
             "map_full_frames": (dims, np.zeros(shape, int)),
-            "dynamic_margin": ((*dims, "feature"), margin),
+            "track_score": ((*dims, "feature"), margin),
             "is_moving": (("scene", "feature"), is_moving),
         },
         {
@@ -87,6 +89,46 @@ def test_markdown_tells_what_is_decided(choice):
     assert f"→ {f1:.3f} [" in line and line.split(" | ")[1].startswith("**")
 
 
+def test_seeds_that_failed_are_told_and_flatter_nobody(choice):
+    """One of 30 went non-finite in one scene after, where it was good."""
+    held_out = choice.held_out.copy(deep=True)
+    held_out.is_finite[1, 0, 4] = False
+    for name in COMPARED:
+        held_out[name][1, 0, 4] = np.nan
+    compared = comparison(choice._replace(held_out=held_out))
+    assert (compared["before"]["seeds_failed"], compared["after"]["seeds_failed"]) == (0, 1)
+    others = choice.held_out.position_rmse_cm.sel(setting=1).drop_sel(seed=4).mean()
+    after = compared["after"]["metrics"]
+    assert after[ALL]["position_rmse_cm"]["mean"] == pytest.approx(float(others))
+    assert compared["paired"][ALL]["loss"]["num_pairs"] == compared["paired"][SCENES[0]]["loss"]["num_pairs"] == 29
+    assert compared["paired"][SCENES[1]]["loss"]["num_pairs"] == 30
+    assert "**0 seeds before and 1 after have a run that went non-finite" in comparison_markdown(compared)
+    assert "went non-finite" not in comparison_markdown(comparison(choice))
+
+
+def test_figures_of_one_scene_have_their_titles_whole(choice):
+    one = choice._replace(held_out=choice.held_out.isel(scene=[0]))
+    for figure in (roc_by_scene_figure(one), roc_by_scene_figure(choice), curves_figure(one)):
+        figure.draw_without_rendering()
+        box = figure._suptitle.get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= figure.bbox.width
+    assert "scenes" not in curves_figure(one)._suptitle.get_text()
+
+
+def test_a_descents_figure_names_its_numbers_as_the_landscape_does():
+    steps = [Step({TH1: 9.0 + k, "config.pixel_std_px": 1.0}, 1.0, 0.5, 0.1, {}, {}, {}, 0) for k in range(3)]
+    titles = [axes.get_title() for axes in descent_figure([steps]).axes]
+    assert titles == ["smoothed objective", "Th₁", "pixel_std_px"]
+
+
+def test_one_scene_stands_for_all_and_a_setting_that_stays_is_told(choice):
+    one = choice._replace(held_out=choice.held_out.isel(scene=[0]))
+    text = comparison_markdown(comparison(one))
+    assert f"| {SCENES[0]} |" in text and f"| {ALL} |" not in text and "No candidate" not in text
+    stays = comparison_markdown(comparison(choice._replace(after=choice.before)))
+    assert "No candidate is better than the setting before" in stays
+
+
 def test_search_and_tuning_are_written_whole(choice, tmp_path):
     paths = write_search(choice, tmp_path / "sweep")
     assert all(path.is_file() and path.stat().st_size > 0 for path in paths)
@@ -98,13 +140,19 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
         "landscape.png", "landscape_scene_1.png", "landscape_scene_2.png", "curves.png", "roc_by_scene.png"
     }  # fmt: skip
 
+    assert "all of these stayed finite" in (tmp_path / "sweep" / "sweep.md").read_text()
     steps = [Step({TH1: 9.0 + k, TH2: 9.0 - k}, 1.0, 0.5, np.nan, {TH1: 0.1, TH2: 0.2}, {}, {}, k) for k in range(3)]
     steps.append(Step({TH1: 12.0, TH2: 6.0}, 1.0, np.nan, np.nan, {TH1: np.nan, TH2: np.nan}, {}, {}, 4))
-    paths = write_tuning(Tuned([steps, steps], choice, 64), {"thresholds": as_grid(choice)}, tmp_path / "tune")
+    left_out = [{TH1: 50.0, TH2: 1.0}]
+    tuned = Tuned([steps, steps], choice, 64, left_out)
+    paths = write_tuning(tuned, {"thresholds": as_grid(choice)}, tmp_path / "tune")
+    told = "1 of 3 starts were left out, 2 of 8 steps were not taken, 14 of 32 pairs of runs were left out of steps"
+    assert told in (tmp_path / "tune" / "tune.md").read_text()
     content = json.loads((tmp_path / "tune" / "tune.json").read_text())
     assert content["before"]["parameters"] == choice.before and content["after"]["parameters"] == choice.after
     assert content["history"][1][2]["parameters"] == {TH1: 11.0, TH2: 7.0}
     assert content["history"][0][3]["loss"] is None and (content["steps_skipped"], content["pairs_failed"]) == (2, 14)
+    assert content["starts_left_out"] == left_out
     assert {"before", "after", "history", "paired"} <= set(content)
     figures = {path.name for path in paths if path.suffix == ".png"}
     assert figures == {"descent.png", "landscape_thresholds.png", "curves.png", "roc_by_scene.png"}
@@ -122,3 +170,5 @@ def test_the_landscape_shows_every_mean_in_its_place(choice):
         assert axes.get_xscale() == axes.get_yscale() == "log"
     linear = grid.assign_coords({TH1: [1.0, 2.0, 3.0]})
     assert landscape_figure(linear, "title").axes[0].get_xlim() == (0.5, 3.5)
+    two = landscape_figure(grid.isel({TH1: [0, 2]}).isel({TH2: [1, 2]}), "title").axes[0]
+    assert (two.get_xscale(), two.get_yscale()) == ("log", "linear") and two.get_xlim() == pytest.approx((2, 32))

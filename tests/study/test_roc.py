@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from vcjax.study import roc
-from vcjax.study.roc import Tracks, precision_at, recall_at, resampled, resamples
+from vcjax.study.roc import Tracks, precision_at, recall_at, resampled, resamples, track_scores
 
 TRACKS = st.lists(
     st.tuples(st.integers(-3, 3), st.booleans(), st.sampled_from([True, True, False])), min_size=4, max_size=16
@@ -44,6 +45,40 @@ def test_curves_are_the_best_that_a_threshold_allows(entries):
     np.testing.assert_allclose(recall_at(tracks, rates)[0], expected)
     precise = [max(p for _, r, p in points if r >= recall - 1e-12) if has_movers else np.nan for recall in recalls]
     np.testing.assert_allclose(precision_at(tracks, recalls)[0], precise)
+
+
+@given(TRACKS)
+def test_the_area_of_a_run_is_the_share_of_its_pairs_in_order(entries):
+    tracks = made(entries)
+    lowest = np.where(tracks.score == -3, -np.inf, tracks.score)  # tracks of which nothing was said are ties
+    for score, is_mover, found in zip(lowest, tracks.is_mover, roc.area_of_each(lowest, tracks.is_mover), strict=True):
+        movers, others = (score[mask & ~np.isnan(score)] for mask in (is_mover, ~is_mover))
+        pairs = [(m > o) + 0.5 * (m == o) for m in movers for o in others]
+        np.testing.assert_allclose(found, np.mean(pairs) if pairs else np.nan)
+
+
+def runs_with(gate, detector, gate_deletions) -> xr.Dataset:
+    data = {"dynamic_margin": gate, "detector_margin": detector, "dynamic_deletions": gate_deletions}
+    finite = {"is_finite": ("seed", [True] * (len(gate) - 1) + [False])}
+    return xr.Dataset({name: (("seed", "feature"), np.array(value)) for name, value in data.items()} | finite)
+
+
+def test_a_track_is_scored_by_what_deletes_it():
+    nan, inf = np.nan, np.inf
+    gate = [[2.0, -1.0, -3.0, nan, nan], [9.0, 9.0, 9.0, 9.0, 9.0]]
+    detector = [[-4.0, 5.0, nan, -2.0, nan], [9.0, 9.0, 9.0, 9.0, 9.0]]
+    by_gate = track_scores(runs_with(gate, detector, [[1, 0, 0, 0, 0]] * 2))
+    np.testing.assert_array_equal(by_gate, [[2.0, 5.0, -3.0, -2.0, nan], [nan] * 5])
+    # A gate that leaves out and deletes nothing has no say; the second of the runs failed, and says nothing of it.
+    by_detector = track_scores(runs_with(gate, detector, [[0] * 5, [1] * 5]))
+    np.testing.assert_array_equal(by_detector, [[-4.0, 5.0, -inf, -2.0, nan], [nan] * 5])
+    tracks = Tracks(by_detector.values, np.array([[False, True, False, False, False]] * 2))
+    np.testing.assert_array_equal(recall_at(tracks, np.array([0.0])), 1.0)
+
+
+def test_tracks_of_which_nothing_was_said_are_called_dynamic_together():
+    tracks = Tracks(np.array([[-np.inf, -np.inf, -np.inf, 1.0]]), np.array([[True, False, False, True]]))
+    np.testing.assert_array_equal(recall_at(tracks, np.array([0.0, 0.5, 1.0]))[0], [0.5, 0.5, 1.0])
 
 
 def test_a_seed_drawn_twice_counts_twice():

@@ -30,7 +30,7 @@ def tiny_runs() -> xr.Dataset:
             "first_mapped": (("seed", "feature"), [[1, 1, 3], [2, 1, 1]]),
             "first_deleted": (("seed", "feature"), [[5, 0, 9], [3, 9, 0]]),
             "dynamic_margin": (("seed", "feature"), [[2.0, -1.0, 1.0], [2.0, np.nan, np.nan]]),
-            "detection_auc": ("seed", [0.5, 1.0]),
+            "detector_margin": (("seed", "feature"), [[np.nan] * 3, [np.nan, 1.75, 1.5]]),
             "is_moving": ("feature", [True, True, False]),
             "is_finite": ("seed", [True, True]),
             "map_full_frames": ("seed", [0, 2]),

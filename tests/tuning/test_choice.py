@@ -10,10 +10,12 @@ import xarray as xr
 
 from vcjax.tuning import choice as module
 from vcjax.tuning import descent
-from vcjax.tuning.choice import ALL, Choice, Seeds, by_scene, choose, setting_of, tracks_of
+from vcjax.tuning import evaluate as evaluate_module
+from vcjax.tuning import tune as tune_module
+from vcjax.tuning.choice import ALL, COMPARED, Choice, Seeds, by_scene, choose, setting_of, tracks_of
 from vcjax.tuning.descent import Schedule, end_of
 from vcjax.tuning.intervals import Interval
-from vcjax.tuning.landscape import around, as_grid, search
+from vcjax.tuning.landscape import around, as_grid, means, search
 from vcjax.tuning.losses import Objective
 from vcjax.tuning.problem import problem_of
 from vcjax.tuning.tune import tune
@@ -64,9 +66,51 @@ def test_figures_and_tracks_of_each_scene_and_of_all(found):
     for name in SCENES:
         one = runs.sel(scene=name)
         np.testing.assert_array_equal(scenes[name].position_rmse_cm, one.position_rmse_cm)
-        np.testing.assert_array_equal(tracks[name].score, one.dynamic_margin)
+        np.testing.assert_array_equal(tracks[name].score, one.track_score)
         np.testing.assert_array_equal(tracks[name].is_mover, np.tile(one.is_moving, (3, 1)))
     np.testing.assert_array_equal(tracks[ALL].score, np.concatenate([tracks[name].score for name in SCENES], axis=1))
+
+
+def with_failed_run(runs: xr.Dataset, **place) -> xr.Dataset:
+    """The same runs, one of which went non-finite."""
+    failed = runs.copy(deep=True)
+    failed.is_finite.loc[place] = False
+    for name in (*COMPARED, "track_score"):
+        if failed[name].dtype == float:
+            failed[name].loc[place] = np.nan
+    return failed
+
+
+def test_a_seed_that_failed_in_one_scene_is_in_no_mean_over_all(found):
+    first = next(iter(SCENES))
+    runs = with_failed_run(found.held_out, setting=1, scene=first, seed=2).isel(setting=1)
+    scenes, tracks = by_scene(runs), tracks_of(runs)
+    assert np.isnan(scenes[ALL].position_rmse_cm[2]) and np.isnan(tracks[ALL].score[2]).all()
+    unharmed = by_scene(found.held_out.isel(setting=1))[ALL]
+    np.testing.assert_array_equal(scenes[ALL].position_rmse_cm[:2], unharmed.position_rmse_cm[:2])
+    assert not np.isnan(tracks["1.0 m/s"].score[2]).all() and not np.isnan(scenes["1.0 m/s"].loss[2])
+
+
+def test_means_of_a_grid_do_not_skip_a_run_that_failed(found):
+    grid = as_grid(found._replace(candidates=with_failed_run(found.candidates, setting=1, scene="1.0 m/s", seed=0)))
+    expected, points = means(as_grid(found)), means(grid)
+    np.testing.assert_array_equal(np.isnan(points.loss), [[True, False, False], [False, False, False]])
+    np.testing.assert_array_equal(points.loss.values.ravel()[1:], expected.loss.values.ravel()[1:])
+    second = as_grid(found).position_rmse_cm.sel(seed=1).mean("scene")
+    assert float(points.position_rmse_cm[0, 0]) == pytest.approx(float(second[0, 0]))
+
+
+def test_a_candidate_with_a_run_that_failed_is_not_chosen(found, monkeypatch):
+    """Though the mean of its others is the least."""
+    best = int(found.candidates.loss.mean(("scene", "seed")).argmin())
+    scene, seed = np.unravel_index(found.candidates.loss[best].argmax(), found.candidates.loss[best].shape)
+    place = {"setting": best, "scene": list(SCENES)[scene], "seed": int(seed)}
+    failed = with_failed_run(found.candidates, **place)
+    assert int(failed.loss.mean(("scene", "seed")).argmin()) == best
+    monkeypatch.setattr(module, "evaluate", lambda *_, **__: failed)
+    candidates = [{path: float(failed[path][i]) for path in (TH1, TH2)} for i in failed.setting.values]
+    other = choose(SCENES, SOFT, candidates, objective=OBJECTIVE, seeds=SEEDS, key=KEY)
+    assert other.after != candidates[best] and other.after in candidates
 
 
 def test_the_landscape_around_a_setting_keeps_the_other_numbers(found):
@@ -86,13 +130,18 @@ def test_runs_that_all_fail_are_refused(found, monkeypatch):
 def test_bad_searches_are_refused(unchecked):
     for axes, seeds, message in (
         ({TH1: [1.0, 2.0]}, SEEDS, "give two paths with their values"),
-        ({TH1: [2.0, 1.0], TH2: [1.0]}, SEEDS, r"search\(axes\['config.gate.th1'\].*in rising order"),
+        ({TH1: [2.0, 1.0], TH2: [1.0]}, SEEDS, r"search\(axes\['config.gate.th1'\]\): .*in rising order"),
+        ({TH1: "many", TH2: [1.0]}, SEEDS, r"axes\['config.gate.th1'\]\): .*in rising order"),
+        ([TH1, TH2], SEEDS, "give two paths with their values"),
+        ({TH1: [1.0], TH2: [1.0]}, 3, r"choose\(seeds=3\): give Seeds"),
         ({TH1: [1.0], TH2: []}, SEEDS, "in rising order"),
         ({TH1: [1.0], "config.gate.th3": [1.0]}, SEEDS, "no numeric leaf 'config.gate.th3'; choose among"),
         ({TH1: [1.0], "scenario.movers.speed_m_s": [1.0]}, SEEDS, r"is \[0.5, 1.0\] in the scenes; give all the same"),
     ):
         with pytest.raises(ValueError, match=message):
             search(SCENES, SOFT, axes, seeds=seeds, key=KEY)
+    with pytest.raises(ValueError, match=r"settings\(scenarios=<list>\): give at least one scene"):
+        search([tiny_runs.scenario()] * 2, SOFT, {TH1: [1.0], TH2: [1.0]}, key=KEY)
     with pytest.raises(ValueError, match=r"Seeds\(choosing=0\): give a whole number of at least 1"):
         Seeds(0, 3)
     with pytest.raises(ValueError, match=r"Seeds\(held_out=0\)"):
@@ -148,6 +197,11 @@ def test_bad_tuning_is_refused_before_any_work(monkeypatch, unchecked):
     monkeypatch.setattr(descent, "run_lanes", lambda *_: pytest.fail("worked"))
     for options, message in (
         ({"num_starts": 0}, r"num_starts=0\): give a whole number of at least 1"),
+        ({"num_starts": True}, r"num_starts=True\): give a whole number"),
+        ({"schedule": 3}, r"schedule=3\): give a Schedule"),
+        ({"seeds": 3}, r"tune\(seeds=3\): give Seeds"),
+        ({"objective": "F1"}, r"tune\(objective='F1'\): give an Objective"),
+        ({"directory": 3}, r"tune\(directory=3\): give a path"),
         ({"key": 0}, r"key=0\)"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -156,3 +210,55 @@ def test_bad_tuning_is_refused_before_any_work(monkeypatch, unchecked):
         tune(SCENES, SOFT, {TH1: Interval(2.0, 3.0)}, key=KEY)
     with pytest.raises(ValueError, match=r"is \[0.5, 1.0\] in the scenes"):
         tune(SCENES, SOFT, {"scenario.movers.speed_m_s": Interval(0.1, 2)}, key=KEY)
+
+
+def broken_at(*starts: int):
+    """Descents by invention: from these starts the objective is not finite."""
+    begun = []
+
+    def descend(problem, start, schedule, *, key, history, progress):
+        begun.append(dict(start))
+        if len(begun) - 1 in starts:
+            raise ValueError(f"the objective is not finite at the start, {start}; start elsewhere.")
+        nan = dict.fromkeys(start, np.nan)
+        steps = list(history) or [
+            descent.Step(dict(start), 1.0, 0.5, np.nan, dict.fromkeys(start, 0.1), {}, {}, 1),
+            descent.Step(dict(start), 0.5, np.nan, np.nan, nan, nan, nan, 2),
+        ]
+        progress(steps)
+        return steps
+
+    return descend, begun
+
+
+def test_a_later_start_where_the_objective_is_not_finite_is_left_out_and_told(tmp_path, found, monkeypatch):
+    monkeypatch.setattr(evaluate_module, "_run_block", lambda *given: invented_block(found, *given))
+    descend, begun = broken_at(1)
+    monkeypatch.setattr(tune_module, "descend", descend)
+    given = {"num_starts": 3, "directory": tmp_path}
+    whole = tuned(**given)
+    assert len(begun) == 3 and len(whole.descents) == 2 and whole.left_out == [begun[1]]
+    assert whole.choice.candidates.sizes["setting"] == 3  # before, and two ends
+    assert (whole.num_steps, whole.num_skipped, whole.num_failed) == (4, 2, 6)
+    # JSON has no NaN: there are nulls, which are read back as what they were; and the start is not tried again.
+    kept = (tmp_path / "descents" / "start_0.json").read_text()
+    assert "NaN" not in kept and json.loads(kept)["steps"][1]["loss"] is None
+    descend, begun = broken_at()
+    monkeypatch.setattr(tune_module, "descend", descend)
+    again = tuned(**given)
+    assert len(begun) == 2 and again.left_out == whole.left_out and again.num_runs == whole.num_runs
+    assert np.isnan(again.descents[0][1].loss) and np.isnan(again.descents[1][1].gradient[TH1])
+    np.testing.assert_equal(again.descents, whole.descents)
+
+
+def test_where_the_parameters_are_an_objective_that_is_not_finite_is_an_error(monkeypatch):
+    monkeypatch.setattr(tune_module, "descend", broken_at(0)[0])
+    with pytest.raises(ValueError, match="not finite at the start"):
+        tuned()
+
+
+def invented_block(found: Choice, scenarios, config, columns, objective, num_seeds, key) -> xr.Dataset:
+    """Runs that were made already, under other settings and as many seeds."""
+    number = len(next(iter(columns.values())))
+    runs = found.held_out.isel(setting=np.zeros(number, int), seed=np.arange(num_seeds)).drop_vars([TH1, TH2])
+    return runs.assign_coords({path: ("setting", values) for path, values in columns.items()})

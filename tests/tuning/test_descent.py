@@ -28,6 +28,7 @@ PARAMETERS = {TH1: Interval(0.2, 50.0, is_log=True), **OSCILLATION}
 START = {TH1: 1.0, A: 0.05, F: 3.0}
 OBJECTIVE = Objective(track_f1=1.0, position=5.0, camera_motion=0.1)
 PROBLEM = problem_of(SCENES, SOFT, PARAMETERS, OBJECTIVE)
+BATCH = eqx.filter_vmap(lambda a: tiny_runs.scenario(oscillation_amplitude_m=a))(jnp.array([0.1, 0.2]))
 ONE_STEP = Schedule(num_steps=1, pairs_per_step=2, learning_rate=0.2)
 
 
@@ -162,6 +163,20 @@ def test_what_goes_non_finite_is_left_out_and_counted(monkeypatch):
     assert rest[0].parameters == rest[1].parameters  # no step was taken from there
 
 
+def test_no_step_is_taken_along_a_gradient_that_is_not_finite():
+    """Nor does the optimiser remember it."""
+    optimiser, free = ONE_STEP.optimiser(), np.array([0.1, -0.2, 0.3])
+    state = optimiser.init(jnp.asarray(free))
+    step = module.Step(START, 1.0, 0.5, 0.1, dict.fromkeys(START, 1.0), dict.fromkeys(START, 0.5), {}, 0)
+    moved, moved_state = module._move(optimiser, free, state, step)
+    assert np.all(moved < free)
+    for gradient in (np.nan, np.inf, -np.inf):
+        broken = step._replace(gradient=step.gradient | {A: gradient})
+        found, found_state = module._move(optimiser, moved, moved_state, broken)
+        np.testing.assert_array_equal(found, moved)
+        assert found_state is moved_state
+
+
 def test_an_objective_that_is_not_finite_at_the_start_is_refused(monkeypatch):
     broken_after(0, monkeypatch)
     with pytest.raises(ValueError, match=r"not finite at the start, {'config.gate.th1': 1.0"):
@@ -173,12 +188,25 @@ def test_bad_problems_are_refused(unchecked):
         ({"config": tiny_runs.config()}, r"smoothing='hard'.*'soft' or 'straight_through'"),
         ({"config": None}, "give a FilterConfig with smoothing"),
         ({"scenarios": {}}, "give at least one scene"),
-        ({"scenarios": [tiny_runs.scenario()]}, "at least one scene by its name"),
+        ({"scenarios": [tiny_runs.scenario()]}, r"tune\(scenarios=<list>\): give at least one scene by its name"),
+        ({"scenarios": {"a": 3}}, r"tune\(scenarios\['a'\]=3\): give a Scenario"),
+        ({"scenarios": {"batch": BATCH}}, r"tune, scenarios\['batch'\]: .* has shape \(2,\), but one number"),
+        ({"objective": 3}, r"tune\(objective=3\): give an Objective"),
         ({"scenarios": SCENES | {"long": tiny_runs.scenario(num_frames=13)}}, "differ in more than numbers"),
         ({"parameters": {}}, "at least one path with its interval"),
         ({"parameters": {"config.gate.th3": Interval(0, 1)}}, "no numeric leaf 'config.gate.th3'; choose among: "),
         ({"parameters": {TH1: (1, 2)}}, "give an Interval"),
-        ({"parameters": {F: Interval(0.5, 5.5)}}, r"high=5.5\): f is below half the frame rate, 5 Hz"),
+        ({"parameters": [TH1]}, r"tune\(parameters=.*at least one path with its interval"),
+        ({"parameters": {F: Interval(0.5, 5.5)}}, r"from 0.5 to 5.5: .*not below half the frame rate of 10"),
+        ({"parameters": {F: Interval(0.5, 5.0)}}, r"from 0.5 to 5: .*not below half the frame rate of 10"),
+        ({"parameters": {F: Interval(-1.0, 4.0)}}, r"from -1 to 4: Oscillation\(frequency_hz=-1.0\)"),
+        ({"parameters": {A: Interval(-0.1, 0.4)}}, r"from -0.1 to 0.4: Oscillation\(amplitude_m=-0.1\)"),
+        ({"parameters": {TH1: Interval(0.0, 4.0)}}, r"from 0 to 4: VirtualCorrection\(th1=0.0\)"),
+        (
+            {"parameters": {"config.pixel_std_px": Interval(-1.0, 4.0)}},
+            r"from -1 to 4: FilterConfig\(pixel_std_px=-1.0",
+        ),
+        ({"parameters": {"config.temperature": Interval(1.0, 4.0)}}, "the schedule sets it"),
         ({"parameters": {A: Interval(0.0, 3.0)}}, r"from 0 to 3: A is a swing of the camera, between 0 and 0.5 m"),
     ):
         given = {"scenarios": SCENES, "config": SOFT, "parameters": PARAMETERS} | arguments
@@ -198,6 +226,11 @@ def test_bad_problems_are_refused(unchecked):
     ):
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_an_end_may_be_the_last_number_that_is_valid():
+    ends = {A: Interval(0.0, 0.5), F: Interval(0.0, 4.999), "config.gate.th2": Interval(0.0, 9.0)}
+    assert problem_of(SCENES, SOFT, ends).paths == tuple(ends)
 
 
 def test_the_numbers_of_the_paper_are_inside():

@@ -9,7 +9,9 @@ import tiny_runs
 import xarray as xr
 
 import vcjax as vc
+from vcjax.study.roc import track_scores
 from vcjax.study.summary import FIGURES, per_run
+from vcjax.tuning import blocks
 from vcjax.tuning import evaluate as module
 from vcjax.tuning.evaluate import evaluate
 from vcjax.tuning.losses import Objective
@@ -42,7 +44,7 @@ def test_figures_are_those_of_monte_carlo(runs):
         found, expected = runs.sel(setting=i, scene=name), per_run(one_by_one)
         for figure in FIGURES:
             np.testing.assert_allclose(found[figure], expected[figure], rtol=1e-12, err_msg=figure)
-        np.testing.assert_array_equal(found.dynamic_margin, one_by_one.dynamic_margin)
+        np.testing.assert_array_equal(found.track_score, track_scores(one_by_one))
         np.testing.assert_array_equal(found.is_deleted, one_by_one.first_deleted > 0)
         np.testing.assert_array_equal(found.is_moving, one_by_one.is_moving)
         motion = 0.5 * (2 * np.pi * 3.0 * amplitude) ** 2
@@ -57,7 +59,7 @@ def test_decisions_are_hard_whatever_the_configuration_says(runs):
 
 
 def test_finished_blocks_are_kept_and_not_run_again(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "RUNS_PER_BLOCK", 4)  # one setting each
+    monkeypatch.setattr(blocks, "RUNS_PER_BLOCK", 4)  # one setting each
 
     def stop(done, total):
         if done == 2:
@@ -76,6 +78,15 @@ def test_finished_blocks_are_kept_and_not_run_again(runs, tmp_path, monkeypatch)
         evaluated(directory=tmp_path, objective=Objective())
     with pytest.raises(ValueError, match=r"other settings \(key: "):
         evaluated(directory=tmp_path, key=jax.random.key(6))
+    more = {path: [*values, values[0]] for path, values in SETTINGS.items()}
+    monkeypatch.setattr(module, "run_lanes", lambda *_: pytest.fail("worked"))
+    changed = {path: [*values[:2], 1.0] for path, values in SETTINGS.items()}
+    with pytest.raises(ValueError, match=r"settings_00002-00002\.nc has other settings \(settings: "):
+        evaluate(SCENES, CONFIG, changed, objective=OBJECTIVE, num_seeds=2, key=KEY, directory=tmp_path)
+    monkeypatch.setattr(blocks, "RUNS_PER_BLOCK", 8)
+    with pytest.raises(ValueError, match=r"settings_00000-00000\.nc is of another number of settings than 4"):
+        evaluate(SCENES, CONFIG, more, objective=OBJECTIVE, num_seeds=2, key=KEY, directory=tmp_path)
+    monkeypatch.setattr(blocks, "RUNS_PER_BLOCK", 4)
     (tmp_path / "settings_00000-00000.nc").write_bytes(b"no")
     with pytest.raises(ValueError, match="not a readable NetCDF-4 file"):
         evaluated(directory=tmp_path)
@@ -93,6 +104,12 @@ def test_bad_input_is_refused_before_any_work(monkeypatch, unchecked):
         ({"settings": {"config.gate.th1": [9.0, -1.0]}}, r"th1=-1.0\)"),
         ({"settings": {"scenario.oscillation.frequency_hz": [6.0]}}, "not below half the frame rate"),
         ({"num_seeds": 0}, r"num_seeds=0\): give at least one seed"),
+        ({"num_seeds": True}, r"num_seeds=True\)"),
+        ({"scenarios": [tiny_runs.scenario()] * 3}, r"evaluate\(scenarios=<list>\): give at least one scene"),
+        ({"settings": [1.0]}, r"evaluate\(settings=\[1.0\]\): give at least one path"),
+        ({"settings": {"config.gate.th2": "many"}}, "all of one length, at least 1"),
+        ({"objective": "F1"}, r"objective='F1'\): give an Objective"),
+        ({"directory": 3}, r"directory=3\): give a path"),
         ({"key": 0}, r"key=0\)"),
     ):
         given = {"scenarios": SCENES, "config": CONFIG, "settings": SETTINGS, "num_seeds": 2, "key": KEY} | arguments

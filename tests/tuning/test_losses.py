@@ -183,5 +183,29 @@ def test_objective_is_the_weighted_sum(unchecked):
     expected = sum(weights[name] * float(value) for name, value in terms.items())
     assert float(Objective(**weights)(scenario, info(), truth())) == pytest.approx(expected)
     assert float(Objective()(scenario, info(), truth())) == pytest.approx(float(terms["track_f1"]))
-    with pytest.raises(ValueError, match=r"Objective\(position=-1.0\): a weight is at least 0"):
-        Objective(position=-1.0)
+
+
+def test_what_a_mover_counts_and_the_temperature_of_the_order_are_the_objectives(unchecked):
+    scenario = paper(oscillation_amplitude_m=0.05)
+    terms = Objective(mover_weight=4.0, ranking_temperature=0.3).terms(scenario, info(), truth())
+    assert float(terms["track_cross_entropy"]) == float(cross_entropy(tracks(info(), truth()), 4.0))
+    assert float(terms["candidate_cross_entropy"]) == float(cross_entropy(candidates(info(), truth()), 4.0))
+    assert float(terms["track_ranking"]) == float(ranking_loss(tracks(info(), truth()), 0.3))
+    usual = Objective().terms(scenario, info(), truth())
+    assert all(terms[name] != usual[name] for name in ("track_cross_entropy", "track_ranking"))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"position": -1.0}, r"Objective\(position=-1.0\): a weight is finite and at least 0"),
+        ({"position": np.inf}, r"Objective\(position=inf\): a weight is finite"),
+        ({"track_f1": 0.0}, "all weights are 0; give one of track_f1, .* a number above 0"),
+        ({"track_f1": 0.0, "mover_weight": 2.0}, "all weights are 0"),
+        ({"mover_weight": 0.0}, r"mover_weight=0.0\): give a positive number"),
+        ({"ranking_temperature": np.inf}, r"ranking_temperature=inf\): give a positive number"),
+    ],
+)
+def test_bad_objectives_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Objective(**fields)

@@ -10,7 +10,7 @@ from vcjax.commands.console import numbered_key, progress_bar, say
 from vcjax.devices import Cores
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.virtual_correction import VirtualCorrection
-from vcjax.report.tuning import write_search
+from vcjax.report.tuning import check_places, write_search
 from vcjax.tuning.choice import Seeds
 from vcjax.tuning.landscape import search
 from vcjax.tuning.losses import WANTED, Objective
@@ -68,6 +68,7 @@ class Sweep:
             self.y: _values("y", self.y_range, self.y_points, self.y_log),
         }
         scenarios, key = self.scenes.make(), numbered_key(self.key)
+        check_places(self.out, "sweep")
         with progress_bar(console, "compiling, first block") as show:
             choice = search(
                 scenarios,

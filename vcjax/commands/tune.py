@@ -11,16 +11,19 @@ from vcjax.commands.console import numbered_key, progress_bar, say
 from vcjax.devices import Cores
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.virtual_correction import VirtualCorrection
-from vcjax.report.tuning import write_tuning
+from vcjax.report.tuning import check_places, write_tuning
+from vcjax.tuning.blocks import check_blocks
 from vcjax.tuning.choice import Seeds
 from vcjax.tuning.descent import Schedule
-from vcjax.tuning.intervals import OSCILLATION, THRESHOLDS
+from vcjax.tuning.intervals import OSCILLATION, THRESHOLDS, Interval
 from vcjax.tuning.landscape import around
 from vcjax.tuning.losses import WANTED, Objective
+from vcjax.tuning.problem import MAX_AMPLITUDE_M
 from vcjax.tuning.scenes import Scenes
 from vcjax.tuning.tune import tune
 
 What = Literal["thresholds", "oscillation", "joint"]
+_LANDSCAPE_SEEDS = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Tune:
     held_out_seeds: int = 100
     """Runs of each scene on which it is compared with the setting before."""
     landscape_points: int = 8
-    """Points along each axis of the landscape that is drawn, with 4 runs of each scene; 0: none."""
+    """Points along each axis of the landscape that is drawn, with 4 runs of each scene, at least 3; 0: none."""
     key: int = 0
     """Number of the base random key."""
     out: Path = Path("results/tune")
@@ -65,18 +68,19 @@ class Tune:
 
     def __call__(self, console: Console) -> None:
         """Tune, draw, report."""
-        if self.landscape_points == 1 or self.landscape_points < 0:
-            raise ValueError(f"--landscape-points {self.landscape_points}: give at least 2, or 0 for no landscape.")
-        ends = ((0.0, self.max_amplitude_m), self.frequency_band_hz)
-        oscillation = {
-            path: dataclasses.replace(interval, low=low, high=high)
-            for (path, interval), (low, high) in zip(OSCILLATION.items(), ends, strict=True)
-        }
-        pairs = {"thresholds": THRESHOLDS, "oscillation": oscillation}
-        chosen = pairs if self.what == "joint" else {self.what: pairs[self.what]}
-        parameters = {path: interval for pair in chosen.values() for path, interval in pair.items()}
+        if self.landscape_points in (1, 2) or self.landscape_points < 0:
+            raise ValueError(f"--landscape-points {self.landscape_points}: give at least 3, or 0 for no landscape.")
         scenarios, directory, key = self.scenes.make(), self.out / self.what, numbered_key(self.key)
         config = FilterConfig(gate=VirtualCorrection(th1=self.th1, th2=self.th2), smoothing=self.smoothing)
+        pairs = {"thresholds": self._thresholds, "oscillation": self._oscillation}
+        chosen = {name: intervals() for name, intervals in pairs.items() if self.what in (name, "joint")}
+        parameters = {path: interval for pair in chosen.values() for path, interval in pair.items()}
+        seeds = Seeds(self.choosing_seeds, self.held_out_seeds)
+        check_places(directory, "tune")
+        for name in chosen if self.landscape_points else ():
+            given = {"objective": self.objective, "num_seeds": _LANDSCAPE_SEEDS, "key": key}
+            num_settings = self.landscape_points**2
+            check_blocks(directory / f"landscape_{name}", scenarios, config, None, num_settings, **given)
         with progress_bar(console, "compiling, first step") as show:
             tuned = tune(
                 scenarios,
@@ -85,7 +89,7 @@ class Tune:
                 objective=self.objective,
                 schedule=self.schedule,
                 num_starts=self.starts,
-                seeds=Seeds(self.choosing_seeds, self.held_out_seeds),
+                seeds=seeds,
                 key=key,
                 directory=directory,
                 progress=lambda name, done, total: show(done, total, name),
@@ -98,7 +102,7 @@ class Tune:
                     pair,
                     objective=self.objective,
                     num_points=self.landscape_points,
-                    num_seeds=4,
+                    num_seeds=_LANDSCAPE_SEEDS,
                     key=key,
                     directory=directory / f"landscape_{name}",
                     progress=lambda done, total, name=name: show(done, total, f"landscape of {name}"),
@@ -110,3 +114,48 @@ class Tune:
         print((directory / "tune.md").read_text())
         for path in paths:
             say(console, f"wrote {path}")
+
+    def _thresholds(self) -> dict[str, Interval]:
+        """Where the thresholds may go.
+
+        Raises:
+            ValueError: naming the option, if one is not inside.
+        """
+        for option, value, interval in zip(("--th1", "--th2"), (self.th1, self.th2), THRESHOLDS.values(), strict=True):
+            _require_inside(option, value, interval)
+        return THRESHOLDS
+
+    def _oscillation(self) -> dict[str, Interval]:
+        """Where A and f may go.
+
+        Raises:
+            ValueError: naming the option, for ends out of range, or if a number is not inside.
+        """
+        (low, high), top = self.frequency_band_hz, self.max_amplitude_m
+        if not 0 < top <= MAX_AMPLITUDE_M:
+            raise ValueError(f"--max-amplitude-m {top:g}: give a length above 0 and up to {MAX_AMPLITUDE_M} m.")
+        half_rate = min(float(scenario.frame_rate_hz) for scenario in self.scenes.make().values()) / 2
+        if not 0 <= low < high < half_rate:
+            raise ValueError(
+                f"--frequency-band-hz {low:g} {high:g}: give two rising numbers, from 0 to below half the frame rate, "
+                f"{half_rate:g} Hz."
+            )
+        (path_A, amplitude), (path_f, frequency) = OSCILLATION.items()
+        amplitude = dataclasses.replace(amplitude, low=0.0, high=top)
+        frequency = dataclasses.replace(frequency, low=low, high=high)
+        _require_inside("--amplitude-m", self.scenes.amplitude_m, amplitude, "--max-amplitude-m")
+        _require_inside("--frequency-hz", self.scenes.frequency_hz, frequency, "--frequency-band-hz")
+        return {path_A: amplitude, path_f: frequency}
+
+
+def _require_inside(option: str, value: float, interval: Interval, bounds: str | None = None) -> None:
+    """Refuse a number to begin with that is not inside its interval, at whose ends there is no way on.
+
+    Raises:
+        ValueError: naming the option, and the one with the bounds where there is one.
+    """
+    if not interval.low < value < interval.high:
+        raise ValueError(
+            f"{option} {value:g}: the first descent begins there; give a number above {interval.low:g} and below "
+            f"{interval.high:g}{f', or other bounds by {bounds}' if bounds else ''}."
+        )

@@ -10,7 +10,7 @@ import xarray as xr
 from vcjax.report.markup import grid
 from vcjax.study import roc
 from vcjax.study.summary import mean_and_error, student_t
-from vcjax.tuning.choice import COMPARED, FALSE_RATE, RECALL, Choice, by_scene, tracks_of
+from vcjax.tuning.choice import ALL, COMPARED, FALSE_RATE, RECALL, Choice, by_scene, tracks_of
 
 _DECIMALS = dict.fromkeys((*COMPARED, RECALL), 2) | {
     "loss": 3,
@@ -31,17 +31,22 @@ _INTRODUCTION = """\
 Hard decisions, {seeds} seeds held out for each scene. Each cell: before → after, and in brackets the 95 % interval of
 the difference, paired by seed; bold where it excludes zero. *F1* = 2 found / (found + static deleted + movers) counts
 the features deleted at least once; *recall at 1 % static* is the share of the movers found if the largest margin of
-each feature is compared with the threshold at which 1 % of the static ones are called dynamic (tracks of all runs
-pooled, bootstrap over seeds); *delay* counts the frames from the birth of a mover to its deletion, where it was found;
-*camera motion* is the mean square speed of the swing, (2πfA)²/2.
+each feature, of gate or detector, is compared with the threshold at which 1 % of the static ones are called dynamic
+(tracks of all runs pooled, bootstrap over seeds); *delay* counts the frames from the birth of a mover to its deletion,
+where it was found; *camera motion* is the mean square speed of the swing, (2πfA)²/2.
+"""
+_FAILED = """\
+**{before} seeds before and {after} after have a run that went non-finite in some scene**: they are in no mean over all
+scenes, and each failed run in none of its scene.
 """
 
 
 def comparison(choice: Choice) -> dict[str, Any]:
     """A choice as plain values: `{"before": {...}, "after": {...}, "paired": {...}, "held_out_seeds": n}`.
 
-    `before` and `after` hold `parameters`, the `loss` (mean and se over all scenes) and by scene, the last of which is
-    all of them, `metrics`: each figure with `mean` and `se`. `paired` holds by scene and figure the `mean` of after -
+    `before` and `after` hold `parameters`, the `loss` (mean and se over all scenes), `seeds_failed` (how many have a
+    run that failed in some scene, and so are in no mean over all scenes) and by scene, the last of which is all of
+    them, `metrics`: each figure with `mean` and `se`. `paired` holds by scene and figure the `mean` of after -
     before, its 95 % interval `lower` to `upper`, and `num_pairs`. Recall at 1 % static has its se and interval by
     bootstrap; the others are Student-t.
     """
@@ -66,8 +71,15 @@ def comparison(choice: Choice) -> dict[str, Any]:
             part[name] = figures
     last = list(paired)[-1]
     sides = {
-        side: {"parameters": dict(setting), "loss": part[last]["loss"], "metrics": part}
-        for side, setting, part in zip(("before", "after"), (choice.before, choice.after), metrics, strict=True)
+        side: {
+            "parameters": dict(setting),
+            "loss": part[last]["loss"],
+            "seeds_failed": int((~each.is_finite.all("scene")).sum()),
+            "metrics": part,
+        }
+        for side, setting, part, each in zip(
+            ("before", "after"), (choice.before, choice.after), metrics, runs, strict=True
+        )
     }
     return sides | {
         "paired": paired,
@@ -88,9 +100,15 @@ def comparison_markdown(compared: Mapping[str, Any]) -> str:
         [f"`{path}`", f"{value:.4g}", f"{after['parameters'][path]:.4g}"]
         for path, value in before["parameters"].items()
     ]
-    sections = [grid(["parameter", "before", "after"], rows), _INTRODUCTION.format(seeds=compared["held_out_seeds"])]
+    introduction = _INTRODUCTION.format(seeds=compared["held_out_seeds"])
+    if before["seeds_failed"] or after["seeds_failed"]:
+        introduction += _FAILED.format(before=before["seeds_failed"], after=after["seeds_failed"])
+    sections = [grid(["parameter", "before", "after"], rows), introduction]
+    if before["parameters"] == after["parameters"]:
+        sections.insert(1, "No candidate is better than the setting before, which stays.\n")
+    scenes = [name for name in compared["paired"] if name != ALL or len(compared["paired"]) > 2]
     for figures in _TABLES:
-        rows = [[scene, *(_cell(compared, scene, figure) for figure in figures)] for scene in compared["paired"]]
+        rows = [[scene, *(_cell(compared, scene, figure) for figure in figures)] for scene in scenes]
         sections.append(grid(["scene", *(_LABELS[figure] for figure in figures)], rows))
     return "\n".join(sections)
 

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from vcjax.report.landscape import LABELS
 from vcjax.report.style import RC, new_figure
 from vcjax.tuning.descent import Step
 
@@ -30,7 +31,7 @@ def descent_figure(descents: Sequence[Sequence[Step]]) -> Figure:
             axes.plot(places, [step.parameters[name] for step in steps], **style)
     panels[0].set_title("smoothed objective")
     for axes, name in zip(panels[1:], names, strict=True):
-        axes.set_title(name.split(".")[-1])
+        axes.set_title(LABELS.get(name, name.split(".")[-1]))
     for axes in panels:
         axes.set_xlabel("step")
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))

@@ -1,6 +1,5 @@
 """What can be told before running: maps of power and of the smallest speed, tables, JSON."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,9 +13,9 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from vcjax.detectability.best_oscillation import Oscillating
 from vcjax.detectability.survey import SEARCHED_M_S, Prediction, Survey
-from vcjax.report.markup import grid, with_nulls
+from vcjax.report.markup import grid
 from vcjax.report.style import RC, new_figure, write_figure
-from vcjax.storage import write_file
+from vcjax.storage import write_file, write_json
 
 _COLOURS = ("#4d4d4d", "#e69f00", "#009e73", "#0072b2", "#cc79a7", "#d55e00")
 _NEVER, _UNSEEN = "#bdbdbd", "white"
@@ -55,9 +54,8 @@ def write_detectability(found: Detectability, directory: Path) -> list[Path]:
     Raises:
         OSError: if the directory cannot be written to.
     """
-    content = json.dumps(with_nulls(as_json(found)), indent=1)
     paths = [
-        write_file(directory / "detectability.json", f"{content}\n".encode()),
+        write_json(directory / "detectability.json", as_json(found)),
         write_file(directory / "detectability.md", markdown(found).encode()),
     ]
     folder = directory / "figures"

@@ -30,7 +30,8 @@ def curves_figure(choice: Choice) -> Figure:
     right.set_xlim(0, 1)
     right.set_ylim(0, 1.02)
     seeds, scenes = choice.held_out.sizes["seed"], choice.held_out.sizes["scene"]
-    _finish(figure, left, f"Tracks of {scenes} scenes × {seeds} held-out runs, 95 % bands")
+    of = f"{scenes} scenes × {seeds}" if scenes > 1 else str(seeds)
+    _finish(figure, left, f"Tracks of {of} held-out runs, 95 % bands")
     return figure
 
 
@@ -51,7 +52,9 @@ def roc_by_scene_figure(choice: Choice) -> Figure:
         _roc_axes(axes)
         axes.set_title(name)
         axes.label_outer()
-    _finish(figure, panels[0, 0], f"ROC over the tracks of {choice.held_out.sizes['seed']} held-out runs, 95 % bands")
+    title = f"ROC over the tracks of {choice.held_out.sizes['seed']} held-out runs, 95 % bands"
+    # A figure of one panel is narrower than its title.
+    _finish(figure, panels[0, 0], title if columns > 1 else title.replace(" of ", "\nof "))
     return figure
 
 

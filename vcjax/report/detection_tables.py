@@ -1,6 +1,5 @@
 """What methods found in the scenes with movers, as files: JSON for programs, Markdown for people, figures."""
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vcjax.report.detection_prediction import prediction_figure, prediction_markdown, predictions
-from vcjax.report.markup import grid, with_nulls
+from vcjax.report.markup import grid
 from vcjax.report.style import RC, new_figure, write_figure
-from vcjax.storage import write_file
+from vcjax.storage import write_file, write_json
 from vcjax.study.detect import METHODS, MIN_FRAMES_MAPPED, Runs, scores
 from vcjax.study.results import describe
 from vcjax.study.summary import paired_difference
@@ -118,8 +117,7 @@ def write_detection(runs: Runs, directory: Path) -> list[Path]:
         OSError: if the directory cannot be written to.
     """
     tables = detection_tables(runs)
-    text = json.dumps(with_nulls(tables), indent=1) + "\n"
-    paths = [write_file(directory / "detect.json", text.encode())]
+    paths = [write_json(directory / "detect.json", tables)]
     paths.append(write_file(directory / "detect.md", detection_markdown(tables).encode()))
     for dynamic_set in dict.fromkeys(cell["dynamic_set"] for cell in tables["cells"]):
         chosen = [cell for cell in tables["cells"] if cell["dynamic_set"] == dynamic_set]

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from vcjax.report.style import RC, new_figure
+from vcjax.tuning.landscape import means
 
 PANELS = {
     "detection_f1": ("F1", "viridis"),
@@ -18,12 +19,13 @@ PANELS = {
     "loss": ("objective", "viridis_r"),
 }
 """Figures shown, their titles, and colours of which the brighter is the better."""
-_LABELS = {
+LABELS = {
     "config.gate.th1": "Th₁",
     "config.gate.th2": "Th₂",
     "scenario.oscillation.amplitude_m": "A, m",
     "scenario.oscillation.frequency_hz": "f, Hz",
 }
+"""What numbers are called on axes, by their paths."""
 
 
 @matplotlib.rc_context(RC)
@@ -33,7 +35,7 @@ def landscape_figure(
     marks: Mapping[str, Mapping[str, float]] | None = None,
     paths: Sequence[Sequence[Mapping[str, float]]] = (),
 ) -> Figure:
-    """F1, AUC, position error and objective over a grid, means over its scenes and seeds.
+    """F1, AUC, position error and objective over a grid, means over its scenes and seeds (see `landscape.means`).
 
     Args:
         grid: runs (x, y, scene, seed), as from `landscape.as_grid`.
@@ -44,24 +46,24 @@ def landscape_figure(
     x, y = (str(dim) for dim in grid.loss.dims[:2])
     figure = new_figure(8.6, 6.6)
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
-    edges = _edges(grid[x].values), _edges(grid[y].values)
+    shown, edges = means(grid), (_edges(grid[x].values), _edges(grid[y].values))
     for axes, (name, (label, colours)) in zip(panels.flat, PANELS.items(), strict=True):
-        values = grid[name].mean(("scene", "seed")).transpose(y, x)
+        values = shown[name].transpose(y, x)
         image = axes.pcolormesh(*edges, values, cmap=colours, shading="flat", rasterized=True)
         figure.colorbar(image, ax=axes)
         axes.grid(False)
         axes.set_title(label)
-        axes.set_xlabel(_LABELS.get(x, x))
-        axes.set_ylabel(_LABELS.get(y, y))
+        axes.set_xlabel(LABELS.get(x, x))
+        axes.set_ylabel(LABELS.get(y, y))
         _scale(axes, grid[x].values, grid[y].values)
         for path in paths:
             way = [p[x] for p in path], [p[y] for p in path]
             axes.plot(*way, color="black", linewidth=2.4)  # an outline, for bright ground
             axes.plot(*way, color="white", linewidth=1.2, marker=".", markersize=3)
-        for (mark, setting), symbol in zip((marks or {}).items(), "os^D", strict=False):
-            axes.plot(
-                setting[x], setting[y], symbol, color="#d55e00", markeredgecolor="white", markersize=8, label=mark
-            )
+        # One setting may be another: then the mark of the first is seen around that of the second.
+        for (mark, setting), symbol, size in zip((marks or {}).items(), "os^D", (12, 8, 8, 8), strict=False):
+            style = {"color": "#d55e00", "markeredgecolor": "white", "markersize": size, "label": mark}
+            axes.plot(setting[x], setting[y], symbol, **style)
         axes.label_outer()
     if marks:
         handles, labels = panels[0, 0].get_legend_handles_labels()
@@ -71,8 +73,10 @@ def landscape_figure(
 
 
 def _is_log(values: np.ndarray) -> bool:
-    """Whether values are spread by equal factors."""
-    return len(values) > 2 and bool(values[0] > 0 and np.ptp(np.diff(np.log(values))) < 1e-6)
+    """Whether values are spread by equal factors; two, if by equal steps their cells would reach below 0."""
+    if len(values) < 2 or values[0] <= 0:
+        return False
+    return bool(values[1] > 3 * values[0]) if len(values) == 2 else bool(np.ptp(np.diff(np.log(values))) < 1e-6)
 
 
 def _edges(values: np.ndarray) -> np.ndarray:

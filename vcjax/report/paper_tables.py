@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import xarray as xr
 
-from vcjax.report.markup import grid, with_nulls
-from vcjax.storage import write_file
+from vcjax.report.markup import grid
+from vcjax.storage import with_nulls, write_file
 from vcjax.study.paper import SPEEDS_M_S, TABLES, Cell, Claim, cells, claims, pairs, paper_figures
 from vcjax.study.summary import DECIMALS, FIGURES, format_mean, paired_difference, runs_text, student_t, summarise
 

@@ -1,6 +1,5 @@
 """What a search for settings gave, as files: JSON for programs, Markdown for people, figures."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,12 +10,11 @@ from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.descent import descent_figure
 from vcjax.report.detection_curves import curves_figure, roc_by_scene_figure
 from vcjax.report.landscape import landscape_figure
-from vcjax.report.markup import with_nulls
 from vcjax.report.style import write_figure
-from vcjax.storage import write_file
+from vcjax.storage import check_writable, write_file, write_json
 from vcjax.study.results import save
 from vcjax.tuning.choice import Choice
-from vcjax.tuning.landscape import as_grid
+from vcjax.tuning.landscape import as_grid, means
 from vcjax.tuning.tune import Tuned
 
 
@@ -24,7 +22,7 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     """Write `tune.json`, `tune.md` and the figures of a tuning into a directory.
 
     `tune.json` is a `comparison` with the `history` of every descent, each step with its parameters, temperature,
-    smoothed loss and gradient; and how many runs there were, and steps and pairs of runs that were left out.
+    smoothed loss and gradient; and how many runs there were, and starts, steps and pairs of runs that were left out.
 
     Args:
         tuned: the tuning.
@@ -42,8 +40,9 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
         "history": [[step._asdict() for step in steps] for steps in tuned.descents],
         "steps_skipped": tuned.num_skipped,
         "pairs_failed": tuned.num_failed,
+        "starts_left_out": [dict(start) for start in tuned.left_out],
     }
-    title = "# Tuned by gradient\n\n" + _runs(compared) + "\n"
+    title = "# Tuned by gradient\n\n" + _runs(compared) + " " + _left_out(tuned) + "\n"
     paths = _write(compared, title, directory / "tune")
     folder = directory / "figures"
     paths += write_figure(descent_figure(tuned.descents), folder / "descent")
@@ -68,13 +67,11 @@ def write_search(choice: Choice, directory: Path) -> list[Path]:
         OSError: if the directory cannot be written to.
     """
     compared, grid = comparison(choice), as_grid(choice)
-    means = grid[["loss", "detection_f1", "detection_auc", "detection_delay_frames", "position_rmse_cm"]].mean(
-        ("scene", "seed")
-    )
-    compared["grid"] = {str(name): values.values.tolist() for name, values in {**means.coords, **means}.items()}
-    compared["grid_dimensions"] = [str(dim) for dim in means.loss.dims]
+    points = means(grid)[["loss", "detection_f1", "detection_auc", "detection_delay_frames", "position_rmse_cm"]]
+    compared["grid"] = {str(name): values.values.tolist() for name, values in {**points.coords, **points}.items()}
+    compared["grid_dimensions"] = [str(dim) for dim in points.loss.dims]
     paths = [save(grid, directory / "sweep.nc")]
-    title = f"# Best point of a grid of {means.loss.size}\n\n" + _runs(compared) + "\n"
+    title = f"# Best point of a grid of {points.loss.size}\n\n" + _runs(compared) + "\n"
     paths += _write(compared, title, directory / "sweep")
     folder, marks = directory / "figures", {"before": choice.before, "best point": choice.after}
     paths += write_figure(landscape_figure(grid, f"Hard decisions, {_means(grid)}", marks), folder / "landscape")
@@ -85,10 +82,19 @@ def write_search(choice: Choice, directory: Path) -> list[Path]:
     return [*paths, *_write_curves(choice, folder)]
 
 
+def check_places(directory: Path, name: str) -> None:
+    """Refuse a directory that the files of `name`, tune or sweep, cannot be written to, before the work.
+
+    Raises:
+        OSError: naming the place and what is wrong with it.
+    """
+    for place in (f"{name}.nc", f"{name}.json", f"{name}.md", "figures/curves.png"):
+        check_writable(directory / place)
+
+
 def _write(compared: dict[str, Any], title: str, path: Path) -> list[Path]:
-    content = json.dumps(with_nulls(compared), indent=1)
     return [
-        write_file(path.with_suffix(".json"), f"{content}\n".encode()),
+        write_json(path.with_suffix(".json"), compared),
         write_file(path.with_suffix(".md"), (title + "\n" + comparison_markdown(compared)).encode()),
     ]
 
@@ -102,11 +108,26 @@ def _write_curves(choice: Choice, folder: Path) -> list[Path]:
 
 def _means(grid: xr.Dataset) -> str:
     scenes, seeds = grid.sizes["scene"], grid.sizes["seed"]
-    return f"means over {f'{scenes} scenes × ' if scenes > 1 else ''}{seeds} runs at every point"
+    runs = f"{scenes} scenes × {seeds} runs" if scenes > 1 else f"{seeds} runs"
+    return f"means over {runs} at every point" if scenes * seeds > 1 else "one run at every point"
 
 
 def _runs(compared: Mapping[str, Any]) -> str:
     runs = compared["runs"]
     parts = [f"{runs['descents']} runs with their derivative in the descents"] if "descents" in runs else []
-    parts += [f"{runs['choosing']} runs to choose", f"{runs['held_out']} held out; {runs['failed']} went non-finite"]
-    return ", ".join(parts) + "."
+    parts += [f"{runs['choosing']} runs to choose", f"{runs['held_out']} held out"]
+    failed = f"{runs['failed']} of these went non-finite" if runs["failed"] else "all of these stayed finite"
+    return f"{', '.join(parts)}; {failed}."
+
+
+def _left_out(tuned: Tuned) -> str:
+    """What the descents went without, since it was not finite."""
+    if not (tuned.num_skipped or tuned.num_failed or tuned.left_out):
+        return f"All {tuned.num_steps} steps were taken, each with all of its runs."
+    counts = (
+        (len(tuned.left_out), len(tuned.left_out) + len(tuned.descents), "starts were left out"),
+        (tuned.num_skipped, tuned.num_steps, "steps were not taken"),
+        (tuned.num_failed, tuned.num_runs // 2, "pairs of runs were left out of steps"),
+    )
+    told = ", ".join(f"{num} of {total} {what}" for num, total, what in counts if num)
+    return f"**Not finite: {told}.**"

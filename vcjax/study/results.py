@@ -208,9 +208,9 @@ def load(path: str | os.PathLike, variables: Collection[str] = RUN_VARIABLES) ->
     return _read(path, lambda dataset: dataset.load(), variables)
 
 
-def load_attributes(path: str | os.PathLike) -> dict[str, Any]:
+def load_attributes(path: str | os.PathLike, variables: Collection[str] = RUN_VARIABLES) -> dict[str, Any]:
     """Read what results come from (see `attributes`), and not the results themselves; otherwise as `load`."""
-    return _read(path, lambda dataset: dataset.attrs, RUN_VARIABLES)
+    return _read(path, lambda dataset: dataset.attrs, variables)
 
 
 def _read(path: str | os.PathLike, part: Callable[[Any], Any], variables: Collection[str]) -> Any:

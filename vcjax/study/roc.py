@@ -1,15 +1,17 @@
 """How well tracks are told apart by a score, at every threshold at once: ROC and precision–recall curves.
 
-The tracks of all runs are pooled: each counts once, with its run's weight. Intervals are by bootstrap over seeds, since
+A track's score is how dynamic it ever looked to what deletes tracks, gate and detector (`track_scores`). For curves the
+tracks of all runs are pooled: each counts once, with its run's weight. Intervals are by bootstrap over seeds, since
 the tracks of a run depend on each other: a resample draws as many seeds as there are, with replacement, and keeps all
 tracks of each. Equal numbers of seeds and resamples draw equal seeds, so that two settings can be compared in pairs.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import stats
 
 FALSE_RATES = np.geomspace(1e-3, 1.0, 61)
 """Shares of the static tracks called dynamic at which curves are given."""
@@ -17,6 +19,45 @@ RECALLS = np.linspace(0.02, 1.0, 50)
 """Shares of the movers found at which curves are given."""
 NUM_RESAMPLES = 1000
 _CONFIDENCE = 0.95
+
+
+def track_scores(runs: Any) -> Any:
+    """The largest margin of each track, of gate and detector whichever is larger: above 0 where it was deleted.
+
+    Both margins are distances to thresholds in χ² units, and either deletes where it is above 0. The margin of a gate
+    without verdicts, which leaves out and deletes nothing, does not count; a gate is taken for one if in none of the
+    runs it has deleted anything, though margins were above 0.
+
+    Args:
+        runs: runs of one filter, an `xarray.Dataset` with the `dynamic_margin`, `detector_margin` and
+            `dynamic_deletions` (..., feature) of `results`, and `is_finite`.
+
+    Returns: xarray.DataArray (..., feature): NaN of a feature that was never a measured candidate, nor judged by the
+        detector, and in runs that failed; -∞ of one of which neither had anything to say.
+    """
+    gate, detector = (runs[name].where(runs.is_finite) for name in ("dynamic_margin", "detector_margin"))
+    is_track = gate.notnull() | detector.notnull()
+    if bool((gate > 0).any()) and not bool((runs.dynamic_deletions > 0).where(runs.is_finite, False).any()):
+        gate = gate.where(False)
+    score = np.fmax(gate, detector)
+    return score.where(score.notnull(), -np.inf).where(is_track)
+
+
+def area_of_each(score: Float[np.ndarray, "*r F"], is_mover: Bool[np.ndarray, "... F"]) -> Float[np.ndarray, "*r"]:
+    """Area under the ROC of each run by itself, from the mean ranks of its tracks (Mann–Whitney).
+
+    Args:
+        score: NaN of what does not count as a track.
+        is_mover: labels, for each run or for all.
+
+    Returns: the share of pairs of a mover and another in the right order, ties half; NaN where there are no pairs.
+    """
+    counts = ~np.isnan(score)
+    ranks = stats.rankdata(np.where(counts, score, np.inf), axis=-1)
+    movers, others = (counts & is_mover).sum(axis=-1), (counts & ~is_mover).sum(axis=-1)
+    right = np.where(counts & is_mover, ranks, 0.0).sum(axis=-1) - movers * (movers + 1) / 2
+    pairs = movers * others
+    return np.where(pairs > 0, right / np.where(pairs > 0, pairs, 1), np.nan)
 
 
 class Tracks(NamedTuple):
@@ -105,7 +146,7 @@ def _counts(tracks: Tracks, weights: np.ndarray | None) -> tuple[np.ndarray, np.
     seed = np.nonzero(counts)[0]
     order = np.argsort(-score, kind="stable")
     # Equal scores are called dynamic together.
-    is_last = np.append(np.diff(score[order]) != 0, True) if len(score) else np.zeros(0, bool)
+    is_last = np.append(score[order][1:] != score[order][:-1], True) if len(score) else np.zeros(0, bool)
     weight = weights[:, seed[order]]
     none = np.zeros((len(weights), 1))
     hits, false = (np.cumsum(weight * chosen, axis=1)[:, is_last] for chosen in (is_mover[order], ~is_mover[order]))

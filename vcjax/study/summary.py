@@ -12,6 +12,8 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from vcjax.study import roc
+
 FIGURES = {
     "position_rmse_cm": "position RMSE, cm",
     "orientation_error_deg": "orientation error, deg",
@@ -80,8 +82,8 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
     `dynamic_found_per_run` and `static_deleted_per_run` count distinct moving and static features deleted at least
     once. With them, and with as many movers as were measured candidates or deleted, `detection_f1` is
     2 found / (found + static deleted + movers), NaN where nothing moves; `detection_auc` is the area under the ROC of
-    the features' largest margin, NaN where no mover was measured, or nothing else. `detection_delay_frames` is the mean
-    over the movers found of the frames from first birth to first deletion.
+    the features' `roc.track_scores`, NaN where no mover was measured, or nothing else. `detection_delay_frames` is the
+    mean over the movers found of the frames from first birth to first deletion.
 
     ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter; frames where it is not
     defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `nis` is the mean squared
@@ -113,7 +115,7 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
                 "dynamic_found_per_run": found,
                 "static_deleted_per_run": (was_deleted & ~runs.is_moving).sum("feature"),
                 "detection_f1": (2 * found / np.maximum(called + num_movers, 1)).where(runs.is_moving.any("feature")),
-                "detection_auc": runs.detection_auc,
+                "detection_auc": _area(runs),
                 "detection_delay_frames": (runs.first_deleted - runs.first_mapped).where(is_found).mean("feature"),
                 "anees_position": runs.nees_position.mean("frame", skipna=True) / _DOF["anees_position"],
                 "anees_pose": runs.nees_pose.mean("frame", skipna=True) / _DOF["anees_pose"],
@@ -259,6 +261,12 @@ def _columns(rows: list[list[str]]) -> str:
 
 def _rms(error: xr.DataArray) -> xr.DataArray:
     return (error**2).mean("frame", skipna=False) ** 0.5
+
+
+def _area(runs: xr.Dataset) -> xr.DataArray:
+    """Area under the ROC of each run."""
+    core = [["feature"], ["feature"]]
+    return xr.apply_ufunc(roc.area_of_each, roc.track_scores(runs), runs.is_moving, input_core_dims=core)
 
 
 def _as_array(figures: xr.Dataset) -> xr.DataArray:

@@ -13,12 +13,13 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from vcjax.fields import require_count
+from vcjax.fields import require_count, require_key, require_kind
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study import roc
 from vcjax.study.sweep import Experiment, number_at, require_paths
-from vcjax.tuning.evaluate import evaluate
+from vcjax.tuning.blocks import check_blocks
+from vcjax.tuning.evaluate import evaluate, stacked
 from vcjax.tuning.losses import Objective
 
 Setting = dict[str, float]
@@ -95,7 +96,11 @@ def choose(
     Raises:
         ValueError: as `evaluate`, or if every candidate has a run that is not finite.
     """
-    choosing_key, held_out_key = jax.random.split(key)
+    require_key("choose", key)
+    require_kind("choose", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=16, held_out=100).")
+    (_, choosing_key), (_, held_out_key) = _kinds(seeds, key)
+    if directory is not None:
+        check_directory(directory, scenarios, config, len(candidates), objective=objective, seeds=seeds, key=key)
 
     def judge(name: str, settings: Sequence[Setting], num_seeds: int, key) -> Any:
         def told(done: int, total: int) -> None:
@@ -122,12 +127,46 @@ def choose(
     return Choice(candidates[0], after, runs, judge("held out", [candidates[0], after], seeds.held_out, held_out_key))
 
 
+def check_directory(
+    directory: Path,
+    scenarios: Mapping[str, Scenario],
+    config: FilterConfig,
+    num_candidates: int,
+    *,
+    objective: Objective,
+    seeds: Seeds,
+    key: PRNGKeyArray,
+) -> None:
+    """Refuse a directory that `choose` could not use, as far as that is known before the candidates are.
+
+    Arguments as of `choose`.
+
+    Raises:
+        ValueError: naming what is of other work.
+        OSError: if the directory cannot be written.
+    """
+    for name, num, (num_seeds, own_key) in zip(
+        ("candidates", "held_out"), (num_candidates, 2), _kinds(seeds, key), strict=True
+    ):
+        given = {"objective": objective, "num_seeds": num_seeds, "key": own_key}
+        check_blocks(directory / name, scenarios, config, None, num, **given)
+
+
+def _kinds(seeds: Seeds, key: PRNGKeyArray) -> tuple[tuple[int, PRNGKeyArray], tuple[int, PRNGKeyArray]]:
+    """Number and base key of the seeds that choose, and of those held out."""
+    choosing_key, held_out_key = jax.random.split(key)
+    return (seeds.choosing, choosing_key), (seeds.held_out, held_out_key)
+
+
 def setting_of(scenarios: Mapping[str, Scenario], config: FilterConfig, paths: Sequence[str]) -> Setting:
     """The numbers at some paths, as scenes and configuration have them.
 
     Raises:
-        ValueError: for a path of no number, or a number that differs between the scenes.
+        ValueError: for a path of no number, or a number that differs between the scenes; or if there are no scenes or
+            no configuration.
     """
+    stacked(scenarios, "settings")
+    require_kind("settings", "config", config, FilterConfig, "give a FilterConfig.")
     setting, experiments = {}, [Experiment(scenario, config) for scenario in scenarios.values()]
     require_paths("settings", experiments[0], paths)
     for path in paths:
@@ -139,19 +178,31 @@ def setting_of(scenarios: Mapping[str, Scenario], config: FilterConfig, paths: S
 
 
 def by_scene(runs: Any) -> dict[str, Any]:
-    """Runs of one setting for each scene, and over all scenes: there a run's figure is the mean of its scenes'."""
+    """Runs of one setting for each scene, and over all scenes (see `over_scenes`)."""
     names = [str(name) for name in runs.scene.values]
     scenes = {name: runs.sel(scene=name)[list(COMPARED)] for name in names}
-    return scenes | {ALL: runs[list(COMPARED)].mean("scene")}
+    return scenes | {ALL: over_scenes(runs)}
+
+
+def over_scenes(runs: Any) -> Any:
+    """Every seed's figures over all scenes: means of the scenes that have the figure.
+
+    A seed whose run failed in any scene has none: the mean of the other scenes would flatter it.
+    """
+    return runs[list(COMPARED)].mean("scene").where(runs.is_finite.all("scene"))
 
 
 def tracks_of(runs: Any) -> dict[str, roc.Tracks]:
-    """The tracks of one setting's runs for each scene, and of all scenes together."""
+    """The tracks of one setting's runs for each scene, and of all scenes together.
+
+    There those of a seed whose run failed in any scene are left out.
+    """
 
     def tracks(runs) -> roc.Tracks:
-        score = runs.dynamic_margin.transpose("seed", ..., "feature")
+        score = runs.track_score.transpose("seed", ..., "feature")
         is_mover = runs.is_moving.broadcast_like(score).transpose(*score.dims)
         num_seeds = score.sizes["seed"]
         return roc.Tracks(score.values.reshape(num_seeds, -1), is_mover.values.reshape(num_seeds, -1))
 
-    return {str(name): tracks(runs.sel(scene=name)) for name in runs.scene.values} | {ALL: tracks(runs)}
+    together = runs.assign(track_score=runs.track_score.where(runs.is_finite.all("scene")))
+    return {str(name): tracks(runs.sel(scene=name)) for name in runs.scene.values} | {ALL: tracks(together)}

@@ -5,9 +5,7 @@ same seeds, so that their differences are paired. With a directory, every finish
 work that was stopped goes on with the next.
 """
 
-import dataclasses
-import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,31 +15,32 @@ import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, PRNGKeyArray
 
-from vcjax.fields import require_key, require_kind
+from vcjax.fields import require_key, require_kind, require_single, require_whole
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.storage import remove_leftovers
+from vcjax.study import roc
 from vcjax.study.monte_carlo import metrics_of, run_lanes, simulate_and_filter
 from vcjax.study.results import (
     PER_FEATURE,
     PER_FRAME,
     PER_RUN,
-    describe,
     import_xarray,
     load,
-    provenance,
-    refuse_other_settings,
     save,
 )
 from vcjax.study.sweep import Experiment, replace_at, require_paths
+from vcjax.tuning.blocks import (
+    KEPT,
+    Settings,
+    as_directory,
+    blocks_of,
+    check_blocks,
+    file_name,
+    hard,
+    origin_of,
+)
 from vcjax.tuning.losses import Objective, camera_motion_m2_s2
-
-Settings = Mapping[str, Sequence[float] | np.ndarray]
-"""Path of a numeric leaf → its value in each setting; all of one length."""
-RUNS_PER_BLOCK = 1024
-"""Runs between two files, about: a minute of work, and a bound on memory."""
-_KEPT = ("loss", "camera_motion_m2_s2", "dynamic_margin", "is_deleted", "is_moving", "is_finite")
-"""What a file of theirs holds at least."""
 
 
 def evaluate(
@@ -68,8 +67,8 @@ def evaluate(
         progress: called with (settings done, settings in all).
 
     Returns: xarray.Dataset with the dimensions (setting, scene, seed): the figures of `summary.per_run`, the `loss`
-        and `camera_motion_m2_s2`; by feature as well `dynamic_margin`, `is_deleted` and `is_moving` (see `detection`).
-        The paths are coordinates.
+        and `camera_motion_m2_s2`; by feature as well `track_score` (see `roc.track_scores`), `is_deleted` and
+        `is_moving`. The paths are coordinates.
 
     Raises:
         ValueError: for arguments that make no sense, before anything compiles; or if the directory holds blocks of
@@ -78,19 +77,24 @@ def evaluate(
         ModuleNotFoundError: if xarray is not installed.
     """
     xr = import_xarray()
-    objective = objective or Objective()
+    directory = as_directory("evaluate", directory)
+    objective = Objective() if objective is None else objective
     columns = _columns(scenarios, config, settings, num_seeds, key)
-    config = dataclasses.replace(config, smoothing="hard", reverse_mode=False)
-    if directory is not None:
-        remove_leftovers(Path(directory), "settings_*.nc")
+    require_kind("evaluate", "objective", objective, Objective, "give an Objective, e.g. Objective(position=2.0).")
+    require_single("evaluate", objective)
+    config = hard(config)
     blocks, num_settings = [], len(next(iter(columns.values())))
-    for first, end in _blocks(num_settings, len(scenarios) * num_seeds):
+    if directory is not None:
+        check_blocks(
+            directory, scenarios, config, columns, num_settings, objective=objective, num_seeds=num_seeds, key=key
+        )
+        remove_leftovers(directory, "settings_*.nc")
+    for first, end in blocks_of(num_settings, len(scenarios) * num_seeds):
         part = {path: values[first:end] for path, values in columns.items()}
-        origin = _origin(scenarios, config, part, objective, num_seeds, key)
-        path = None if directory is None else Path(directory) / f"settings_{first:05d}-{end - 1:05d}.nc"
+        origin = origin_of(scenarios, config, part, objective, num_seeds, key)
+        path = None if directory is None else directory / file_name(first, end)
         if path is not None and path.is_file():
-            block = load(path, _KEPT)
-            refuse_other_settings(path, block.attrs, origin)
+            block = load(path, KEPT)
         else:
             block = _run_block(scenarios, config, part, objective, num_seeds, key)
             block = block.assign_coords(setting=np.arange(first, end)).assign_attrs(origin)
@@ -102,16 +106,20 @@ def evaluate(
     return xr.concat(blocks, "setting", data_vars="minimal", coords="minimal", compat="override", combine_attrs="drop")
 
 
-def stacked(scenarios: Mapping[str, Scenario]) -> Scenario:
+def stacked(scenarios: Mapping[str, Scenario], owner: str = "evaluate") -> Scenario:
     """Scenes as one, with a leading axis.
 
     Raises:
-        ValueError: if there is none, or if they differ in more than numbers.
+        ValueError: naming the owner; if there is none, one is a batch, or they differ in more than numbers.
     """
-    if not isinstance(scenarios, Mapping) or not scenarios:
-        raise ValueError(f"scenarios={scenarios!r}: give at least one scene by its name, a mapping.")
+    remedy = "give at least one scene by its name, a mapping."
+    require_kind(owner, "scenarios", scenarios, Mapping, remedy)
+    if not scenarios:
+        raise ValueError(f"{owner}(scenarios={{}}): {remedy}")
     for name, scenario in scenarios.items():
-        require_kind("scenarios", repr(name), scenario, Scenario, "give a Scenario, e.g. vcjax.scenarios.paper().")
+        label = f"scenarios[{name!r}]"
+        require_kind(owner, label, scenario, Scenario, "give a Scenario, e.g. vcjax.scenarios.paper().")
+        require_single(f"{owner}, {label}", scenario)
     shapes = {(jax.tree.structure(s), tuple(np.shape(leaf) for leaf in jax.tree.leaves(s))) for s in scenarios.values()}
     if len(shapes) > 1:
         raise ValueError("scenarios differ in more than numbers; give all as many frames and features.")
@@ -127,12 +135,14 @@ def _columns(scenarios, config, settings: Settings, num_seeds: int, key) -> dict
     """The settings as arrays; each is tried, so that one out of range is refused here."""
     require_key("evaluate", key)
     require_kind("evaluate", "config", config, FilterConfig, "give a FilterConfig.")
+    require_single("evaluate", config)
     stacked(scenarios)
-    if not isinstance(num_seeds, int | np.integer) or num_seeds < 1:
-        raise ValueError(f"evaluate(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
-    if not isinstance(settings, Mapping) or not settings:
-        raise ValueError(f"evaluate(settings={settings!r}): give at least one path with its values.")
-    columns = {path: np.asarray(values, float) for path, values in settings.items()}
+    require_whole("evaluate", "num_seeds", num_seeds, 1)
+    remedy = "give at least one path with its values, a mapping."
+    require_kind("evaluate", "settings", settings, Mapping, remedy)
+    if not settings:
+        raise ValueError(f"evaluate(settings={{}}): {remedy}")
+    columns = {path: as_numbers(values) for path, values in settings.items()}
     lengths = {values.shape for values in columns.values()}
     if len(lengths) > 1 or any(len(shape) != 1 or shape[0] == 0 for shape in lengths):
         raise ValueError("evaluate(settings): give every path a list of values, all of one length, at least 1.")
@@ -144,10 +154,12 @@ def _columns(scenarios, config, settings: Settings, num_seeds: int, key) -> dict
     return columns
 
 
-def _blocks(num_settings: int, runs_each: int) -> Iterator[tuple[int, int]]:
-    """First setting and end of each block."""
-    size = max(1, RUNS_PER_BLOCK // runs_each)
-    yield from ((first, min(first + size, num_settings)) for first in range(0, num_settings, size))
+def as_numbers(values: object) -> np.ndarray:
+    """A list of numbers as an array; an empty one of what is none."""
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        return np.empty(0)
 
 
 def _run_block(scenarios, config, columns, objective: Objective, num_seeds: int, key) -> Any:
@@ -171,7 +183,7 @@ def _run_block(scenarios, config, columns, objective: Objective, num_seeds: int,
         loss=runs.loss.where(runs.is_finite),
         camera_motion_m2_s2=runs.camera_motion_m2_s2,
         map_full_frames=runs.map_full_frames,
-        dynamic_margin=runs.dynamic_margin.where(runs.is_finite),
+        track_score=roc.track_scores(runs),
         is_deleted=(runs.first_deleted > 0) & runs.is_finite,
         is_moving=runs.is_moving.isel(setting=0, seed=0),
     )
@@ -187,14 +199,3 @@ def _run_lane(scenes: Scenario, config: FilterConfig, objective: Objective, lane
     scenario = experiment.scenario
     costs = {"loss": objective(scenario, info, truth), "camera_motion_m2_s2": camera_motion_m2_s2(scenario)}
     return metrics_of(experiment, info, truth) | costs
-
-
-def _origin(scenarios, config, columns, objective: Objective, num_seeds: int, key) -> dict[str, Any]:
-    """What a block comes from, as it is kept beside it."""
-    return provenance(key) | {
-        "scenarios": json.dumps({name: describe(scenario) for name, scenario in scenarios.items()}),
-        "config": json.dumps(describe(config)),
-        "settings": json.dumps({path: values.tolist() for path, values in columns.items()}),
-        "objective": json.dumps(describe(objective)),
-        "num_seeds": num_seeds,
-    }

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from vcjax.fields import require_key
+from vcjax.fields import require_key, require_kind
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study.results import import_xarray
-from vcjax.tuning.choice import Choice, Seeds, Setting, choose, setting_of
-from vcjax.tuning.evaluate import evaluate
+from vcjax.tuning.blocks import as_directory
+from vcjax.tuning.choice import Choice, Seeds, Setting, choose, over_scenes, setting_of
+from vcjax.tuning.evaluate import as_numbers, evaluate
 from vcjax.tuning.intervals import Interval
 from vcjax.tuning.losses import Objective
 
@@ -55,12 +56,20 @@ def search(
         scenarios,
         config,
         candidates,
-        objective=objective or Objective(),
-        seeds=seeds or Seeds(),
+        objective=Objective() if objective is None else objective,
+        seeds=Seeds() if seeds is None else seeds,
         key=key,
-        directory=None if directory is None else Path(directory),
+        directory=as_directory("search", directory),
         progress=progress,
     )
+
+
+def means(grid: Any) -> Any:
+    """Every figure at every point of a grid: its mean over scenes, then over the seeds that did not fail in any.
+
+    The `loss` has none where a run failed, as in the choice of the best.
+    """
+    return over_scenes(grid).mean("seed").assign(loss=grid.loss.mean(("scene", "seed"), skipna=False))
 
 
 def as_grid(choice: Choice) -> Any:
@@ -124,10 +133,12 @@ def _axes(axes: Mapping[str, Sequence[float] | np.ndarray]) -> dict[str, np.ndar
     Raises:
         ValueError: unless they are two lists of numbers that differ.
     """
-    if not isinstance(axes, Mapping) or len(axes) != 2:
-        raise ValueError(f"search(axes={axes!r}): give two paths with their values.")
-    values = {path: np.asarray(listed, float) for path, listed in axes.items()}
+    remedy = "give two paths with their values, a mapping."
+    require_kind("search", "axes", axes, Mapping, remedy)
+    if len(axes) != 2:
+        raise ValueError(f"search(axes={list(axes)}): {remedy}")
+    values = {path: as_numbers(listed) for path, listed in axes.items()}
     for path, listed in values.items():
         if listed.ndim != 1 or listed.size == 0 or not np.all(np.isfinite(listed)) or np.any(np.diff(listed) <= 0):
-            raise ValueError(f"search(axes[{path!r}]={axes[path]!r}): give numbers in rising order.")
+            raise ValueError(f"search(axes[{path!r}]): give at least one number, in rising order.")
     return values

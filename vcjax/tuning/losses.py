@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vcjax.fields import number, require
+from vcjax.fields import is_concrete, number, require
 from vcjax.filter.info import FrameInfo
 from vcjax.recording import Truth
 from vcjax.simulation.scenarios import Scenario
@@ -126,8 +126,15 @@ def camera_motion_m2_s2(scenario: Scenario) -> Float[Array, ""]:
     return 0.5 * (2.0 * jnp.pi * jnp.asarray(f) * A) ** 2
 
 
+_SHAPES = ("mover_weight", "ranking_temperature")
+"""Fields of an objective that are no weights of losses."""
+
+
 class Objective(eqx.Module):
-    """What is wanted of a setting: a weighted sum of the losses of this module. All weights are at least 0."""
+    """What is wanted of a setting: a weighted sum of the losses of this module.
+
+    All weights are at least 0, and one of them is more.
+    """
 
     track_f1: float = eqx.field(converter=number, default=1.0)
     """Weight of 1 - F1 of the tracks (`f1_loss`)."""
@@ -145,20 +152,30 @@ class Objective(eqx.Module):
     """Weight of (ln ANEES)² of the position (`inconsistency`)."""
     camera_motion: float = eqx.field(converter=number, default=0.0)
     """Weight of the camera's mean square speed, (2πfA)²/2 (`camera_motion_m2_s2`), s²/m²."""
+    mover_weight: float = eqx.field(converter=number, default=1.0)
+    """What a mover counts in the `cross_entropy` of tracks and candidates, where another counts 1; positive."""
+    ranking_temperature: float = eqx.field(converter=number, default=1.0)
+    """τ of the order in the `ranking_loss`, in log-odds; positive."""
 
     def __check_init__(self):
-        for name in vars(self):
-            require(self, name, lambda w: np.isfinite(w) & (w >= 0), "a weight is at least 0.")
+        weights = [name for name in vars(self) if name not in _SHAPES]
+        for name in weights:
+            require(self, name, lambda w: np.isfinite(w) & (w >= 0), "a weight is finite and at least 0.")
+        for name in _SHAPES:
+            require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
+        values = [getattr(self, name) for name in weights]
+        if all(map(is_concrete, values)) and not np.all(np.sum(np.broadcast_arrays(*values), axis=0) > 0):
+            raise ValueError(f"Objective: all weights are 0; give one of {', '.join(weights)} a number above 0.")
 
     def terms(self, scenario: Scenario, info: FrameInfo, truth: Truth) -> dict[str, Float[Array, ""]]:
         """The losses by the names of their weights, not weighted."""
         of_tracks, of_candidates = tracks(info, truth), candidates(info, truth)
         return {
             "track_f1": f1_loss(of_tracks),
-            "track_cross_entropy": cross_entropy(of_tracks),
-            "track_ranking": ranking_loss(of_tracks),
+            "track_cross_entropy": cross_entropy(of_tracks, self.mover_weight),
+            "track_ranking": ranking_loss(of_tracks, self.ranking_temperature),
             "candidate_f1": f1_loss(of_candidates),
-            "candidate_cross_entropy": cross_entropy(of_candidates),
+            "candidate_cross_entropy": cross_entropy(of_candidates, self.mover_weight),
             "position": position_rmse_m(info, truth),
             "consistency": inconsistency(info, truth),
             "camera_motion": camera_motion_m2_s2(scenario),

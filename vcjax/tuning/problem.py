@@ -7,10 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from vcjax.fields import require_kind
+from vcjax.fields import require_kind, require_single
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
-from vcjax.study.sweep import Experiment, require_paths
+from vcjax.study.sweep import Experiment, replace_at, require_paths
 from vcjax.tuning.evaluate import stacked
 from vcjax.tuning.intervals import Interval
 from vcjax.tuning.losses import Objective
@@ -75,29 +75,51 @@ def problem_of(
         objective: what to make small; soft F1 of the tracks if None.
 
     Raises:
-        ValueError: for hard decisions, scenes that differ in structure, unknown paths, frequencies that the frame rate
-            cannot show, or amplitudes above `MAX_AMPLITUDE_M`.
+        ValueError: for hard decisions, scenes that differ in structure, unknown paths, intervals with an end that
+            scenario or configuration refuse, such as a frequency that the frame rate cannot show, or amplitudes above
+            `MAX_AMPLITUDE_M`.
     """
-    scenes = stacked(scenarios)
+    scenes = stacked(scenarios, "tune")
     require_kind("tune", "config", config, FilterConfig, "give a FilterConfig with smoothing='soft'.")
+    require_single("tune", config)
+    if objective is not None:
+        require_kind("tune", "objective", objective, Objective, "give an Objective, e.g. Objective(position=2.0).")
+        require_single("tune", objective)
     if config.smoothing == "hard":
         raise ValueError(
             "tune(config.smoothing='hard'): give smoothing 'soft' or 'straight_through', which have a derivative."
         )
-    if not isinstance(parameters, Mapping) or not parameters:
-        raise ValueError(f"tune(parameters={parameters!r}): give at least one path with its interval.")
-    rate = min(float(scenario.frame_rate_hz) for scenario in scenarios.values())
-    require_paths("tune", Experiment(next(iter(scenarios.values())), config), parameters)
+    remedy = "give at least one path with its interval, a mapping."
+    require_kind("tune", "parameters", parameters, Mapping, remedy)
+    if not parameters:
+        raise ValueError(f"tune(parameters={{}}): {remedy}")
+    experiments = [Experiment(scenario, config) for scenario in scenarios.values()]
+    require_paths("tune", experiments[0], parameters)
     for path, interval in parameters.items():
         require_kind("tune", f"parameters[{path!r}]", interval, Interval, "give an Interval(low, high).")
-        if path == "scenario.oscillation.frequency_hz" and interval.high > rate / 2:
-            raise ValueError(
-                f"tune(parameters[{path!r}].high={interval.high:g}): f is below half the frame rate, {rate / 2:g} Hz."
-            )
+        if path == "config.temperature":
+            raise ValueError(f"tune(parameters[{path!r}]): the schedule sets it; give another path.")
+        for experiment in experiments:
+            _require_ends(experiment, path, interval)
         if path == "scenario.oscillation.amplitude_m" and not 0 <= interval.low < interval.high <= MAX_AMPLITUDE_M:
             raise ValueError(
                 f"tune(parameters[{path!r}]) from {interval.low:g} to {interval.high:g}: A is a swing of the camera, "
                 f"between 0 and {MAX_AMPLITUDE_M} m."
             )
     config = dataclasses.replace(config, reverse_mode=len(parameters) > FORWARD_MODE_UP_TO)
-    return Problem(scenes, config, objective or Objective(), tuple(parameters), tuple(parameters.values()))
+    objective = Objective() if objective is None else objective
+    return Problem(scenes, config, objective, tuple(parameters), tuple(parameters.values()))
+
+
+def _require_ends(experiment: Experiment, path: str, interval: Interval) -> None:
+    """Refuse an interval with an end that is no number for its place; a descent may come as near to it as it likes.
+
+    Raises:
+        ValueError: naming path and interval, and what is wrong with the end.
+    """
+    low, high = interval.low, interval.high
+    for end in (low, high):
+        try:
+            replace_at(experiment, {path: end})
+        except ValueError as error:
+            raise ValueError(f"tune(parameters[{path!r}]) from {low:g} to {high:g}: {error}") from None

@@ -2,6 +2,9 @@
 
 import dataclasses
 
+import numpy as np
+
+from vcjax.fields import require_kind
 from vcjax.simulation.scenarios import DynamicMotion, DynamicSet, RobotMotion, Scenario, paper
 
 
@@ -28,20 +31,26 @@ class Scenes:
         """The scenes by name, e.g. "inverse forward, 0.5 m/s".
 
         Raises:
-            ValueError: if there is none, or for numbers out of range.
+            ValueError: if there is none, one comes twice, or for numbers out of range.
         """
-        if not self.motions or not self.speeds_m_s:
-            raise ValueError(f"Scenes(motions={self.motions}, speeds_m_s={self.speeds_m_s}): give at least one each.")
-        return {
-            f"{motion.replace('_', ' ')}, {speed:g} m/s": paper(
-                robot=self.robot,
-                dynamic=motion,
-                dynamic_speed_m_s=speed,
-                dynamic_set=self.dynamic_set,
-                oscillation_amplitude_m=self.amplitude_m,
-                oscillation_frequency_hz=self.frequency_hz,
-                num_frames=self.num_frames,
-            )
-            for motion in self.motions
-            for speed in self.speeds_m_s
-        }
+        for name, values in (("motions", self.motions), ("speeds_m_s", self.speeds_m_s)):
+            remedy = "give at least one, in a tuple, each once."
+            require_kind("Scenes", name, values, (tuple, list), remedy)
+            if not values or len(set(values)) < len(values):
+                raise ValueError(f"Scenes({name}={values!r}): {remedy}")
+        scenes = {}
+        for motion in self.motions:
+            for speed in self.speeds_m_s:
+                scenario = paper(
+                    robot=self.robot,
+                    dynamic=motion,
+                    dynamic_speed_m_s=speed,
+                    dynamic_set=self.dynamic_set,
+                    oscillation_amplitude_m=self.amplitude_m,
+                    oscillation_frequency_hz=self.frequency_hz,
+                    num_frames=self.num_frames,
+                )
+                # With all digits that tell numbers apart, which names of scenes do.
+                shown = np.format_float_positional(speed, trim="-")
+                scenes[f"{motion.replace('_', ' ')}, {shown} m/s"] = scenario
+        return scenes

@@ -6,7 +6,8 @@ goes on to the same numbers.
 """
 
 import json
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,12 +16,13 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from scipy.stats import qmc
 
-from vcjax.fields import require_key
+from vcjax.fields import require_key, require_kind, require_whole
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
-from vcjax.storage import write_file
+from vcjax.storage import check_writable, with_nulls, write_json
 from vcjax.study.results import describe, import_xarray, provenance, refuse_other_settings
-from vcjax.tuning.choice import Choice, Seeds, Setting, choose, setting_of
+from vcjax.tuning.blocks import as_directory
+from vcjax.tuning.choice import Choice, Seeds, Setting, check_directory, choose, setting_of
 from vcjax.tuning.descent import Schedule, Step, descend, end_of
 from vcjax.tuning.intervals import Interval
 from vcjax.tuning.losses import Objective
@@ -34,11 +36,18 @@ class Tuned(NamedTuple):
     """What tuning gave."""
 
     descents: list[list[Step]]
-    """Every step from every start; the first start is where the parameters were."""
+    """Every step from every start that was not left out; the first is where the parameters were."""
     choice: Choice
     """Where they were, the best end of a descent, and what it is worth."""
     num_runs: int
     """Runs in the descents, each with its derivative."""
+    left_out: Sequence[Setting] = ()
+    """Starts without a descent, since the objective was not finite there."""
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of all descents."""
+        return sum(map(len, self.descents))
 
     @property
     def num_skipped(self) -> int:
@@ -74,60 +83,68 @@ def tune(
         objective: what to make small; F1 of the tracks if None.
         schedule: steps, seeds and temperatures of each descent.
         num_starts: descents; the first from where the parameters are, the others from points spread over the intervals
-            (a Halton sequence), since an objective may have several valleys.
+            (a Halton sequence), since an objective may have several valleys. One of the others where the objective is
+            not finite is left out.
         seeds: to choose the best end of a descent, and to compare it with the start.
         key: base key.
         directory: where the work is kept, and looked for.
         progress: called with what was done last, and how much of how many steps or settings.
 
     Raises:
-        ValueError: for arguments that make no sense, before anything compiles; for an objective that is not finite at a
-            start; or if the directory holds other work.
+        ValueError: for arguments that make no sense, before anything compiles; for an objective that is not finite
+            where the parameters are; or if the directory holds other work.
         OSError: if the directory cannot be written.
         ModuleNotFoundError: if xarray is not installed.
     """
     import_xarray()
     require_key("tune", key)
-    schedule, directory = schedule or Schedule(), None if directory is None else Path(directory)
-    if not isinstance(num_starts, int | np.integer) or num_starts < 1:
-        raise ValueError(f"tune(num_starts={num_starts!r}): give a whole number of at least 1.")
+    schedule, seeds = Schedule() if schedule is None else schedule, Seeds() if seeds is None else seeds
+    require_kind("tune", "schedule", schedule, Schedule, "give a Schedule, e.g. Schedule(num_steps=20).")
+    require_kind("tune", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=16, held_out=100).")
+    require_whole("tune", "num_starts", num_starts, 1)
+    directory = as_directory("tune", directory)
     problem = problem_of(scenarios, config, parameters, objective)
     starts = _starts(problem, setting_of(scenarios, config, problem.paths), num_starts)
     origin = _origin(scenarios, problem, schedule, key)
     descent_key, choice_key = jax.random.split(key)
-    descents = []
-    for number, start in enumerate(starts):
-        kept = None if directory is None else _KeptSteps(directory / "descents" / f"start_{number}.json", origin, start)
+    kept = [_KeptSteps(directory, number, origin, start) for number, start in enumerate(starts)]
+    before = [each.read() for each in kept]
+    if directory is not None:
+        num_candidates = 1 + sum(history is not None for history in before)
+        given = {"objective": problem.objective, "seeds": seeds, "key": choice_key}
+        check_directory(directory, scenarios, config, num_candidates, **given)
+    descents, left_out = [], []
+    for number, (start, history) in enumerate(zip(starts, before, strict=True)):
 
-        def told(history: list[Step], kept=kept, number=number):
-            if kept is not None:
-                kept.write(history)
+        def told(history: list[Step], number=number):
+            kept[number].write(history)
             if progress is not None:
                 loss = f"descent {number + 1} of {num_starts}, loss {history[-1].loss:.3f}"
                 progress(loss, len(history), schedule.num_steps)
 
-        descents.append(
-            descend(
-                problem,
-                start,
-                schedule,
-                key=jax.random.fold_in(descent_key, number),
-                history=() if kept is None else kept.read(),
-                progress=told,
-            )
-        )
+        if history is not None:
+            own_key = jax.random.fold_in(descent_key, number)
+            try:
+                descents.append(descend(problem, start, schedule, key=own_key, history=history, progress=told))
+                continue
+            except ValueError as error:
+                # Where the parameters are, this is for the user to know; elsewhere it is one start less.
+                if number == 0 or "not finite at the start" not in str(error):
+                    raise
+            kept[number].write(None)
+        left_out.append(start)
     choice = choose(
         scenarios,
         config,
         [starts[0], *(end_of(problem, steps) for steps in descents)],
         objective=problem.objective,
-        seeds=seeds or Seeds(),
+        seeds=seeds,
         key=choice_key,
         directory=directory,
         progress=progress,
     )
     runs_per_step = 2 * schedule.pairs_per_step * len(scenarios)
-    return Tuned(descents, choice, runs_per_step * sum(map(len, descents)))
+    return Tuned(descents, choice, runs_per_step * (sum(map(len, descents)) + len(left_out)), left_out)
 
 
 def _starts(problem: Problem, before: dict[str, float], num: int) -> list[dict[str, float]]:
@@ -151,29 +168,49 @@ def _origin(scenarios, problem: Problem, schedule: Schedule, key) -> dict[str, A
 
 
 class _KeptSteps(NamedTuple):
-    """The file of a descent's steps."""
+    """The file of a descent's steps; none without a directory."""
 
-    path: Path
+    directory: Path | None
+    number: int
     origin: dict[str, Any]
     start: Setting
 
-    def write(self, history: list[Step]) -> None:
-        """Write all steps, completely or not at all."""
-        content = {"origin": self.origin, "start": self.start, "steps": [step._asdict() for step in history]}
-        write_file(self.path, f"{json.dumps(content, indent=1)}\n".encode())
+    @property
+    def path(self) -> Path | None:
+        """Where it is."""
+        return None if self.directory is None else self.directory / "descents" / f"start_{self.number}.json"
 
-    def read(self) -> list[Step]:
-        """The steps made already.
+    def write(self, history: list[Step] | None) -> None:
+        """Write all steps, completely or not at all; None: the start was left out."""
+        if self.path is not None:
+            steps = None if history is None else [step._asdict() for step in history]
+            write_json(self.path, {"origin": self.origin, "start": self.start, "steps": steps})
+
+    def read(self) -> list[Step] | None:
+        """The steps made already; None if the start was left out.
 
         Raises:
             ValueError: if they are of other work, or not readable.
+            OSError: if none could be written.
         """
+        if self.path is None:
+            return []
+        check_writable(self.path)
         if not self.path.is_file():
             return []
         try:
             content = json.loads(self.path.read_text())
-            found, steps = content["origin"] | {"start": content["start"]}, [Step(**s) for s in content["steps"]]
+            found, steps = content["origin"] | {"start": content["start"]}, content["steps"]
+            steps = None if steps is None else [Step(**_with_nan(step)) for step in steps]
         except (ValueError, TypeError, KeyError) as error:
             raise ValueError(f"{self.path}: no steps of a descent ({error}); remove it and run again.") from None
-        refuse_other_settings(self.path, found, json.loads(json.dumps(self.origin | {"start": self.start})))
+        expected = json.loads(json.dumps(with_nulls(self.origin | {"start": self.start})))
+        refuse_other_settings(self.path, with_nulls(found), expected)
         return steps
+
+
+def _with_nan(value: Any) -> Any:
+    """What was read, with the numbers that JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _with_nan(item) for key, item in value.items()}
+    return math.nan if value is None else value
