@@ -4,7 +4,7 @@ import numpy as np
 from fake_runs import fake_runs
 
 from vcjax.report.detection_roc import _pooled, roc_figure, separation
-from vcjax.study.detect import Scene
+from vcjax.study.detection_scenes import Scene
 from vcjax.study.paper import Cell
 
 RUNS = fake_runs(Cell(4, "forward", "lateral", 1.0, "VC", True), num_seeds=6)
