@@ -28,7 +28,7 @@ PARAMETERS = {TH1: Interval(0.2, 50.0, is_log=True), **OSCILLATION}
 START = {TH1: 1.0, A: 0.05, F: 3.0}
 OBJECTIVE = Objective(track_f1=1.0, position=5.0, camera_motion=0.1)
 PROBLEM = problem_of(SCENES, SOFT, PARAMETERS, OBJECTIVE)
-BATCH = eqx.filter_vmap(lambda a: tiny_runs.scenario(oscillation_amplitude_m=a))(jnp.array([0.1, 0.2]))
+BATCH = eqx.tree_at(lambda s: s.pixel_std_px, tiny_runs.scenario(), jnp.array([1.0, 2.0]))
 ONE_STEP = Schedule(num_steps=1, pairs_per_step=2, learning_rate=0.2)
 
 
