@@ -47,10 +47,10 @@ def test_detector_is_the_one_named_with_options_of_its_own(name, tmp_path, monke
     monkeypatch.setattr(
         "vcjax.commands.simulate.monte_carlo", lambda _, config, **__: seen.append(config) or fake_runs(num_seeds=2)
     )
-    own = {"velocity_glr": ["--threshold", "20", "--innovations", "corrected"], "cusum": ["--drift", "3"]}
+    own = {"velocity_glr": ["--threshold", "20", "--velocity-std-m-s", "1"], "cusum": ["--drift", "3"]}
     named = [] if name is None else ["--detector", name]
     assert main(["simulate", "--gate", "RE", *named, *own.get(name, [])]) == 0
-    expected = {"velocity_glr": vc.VelocityGLR(threshold=20, innovations="corrected"), "cusum": vc.Cusum(3.0)}
+    expected = {"velocity_glr": vc.VelocityGLR(threshold=20, velocity_std_m_s=1.0), "cusum": vc.Cusum(3.0)}
     assert describe(seen[0].detector) == describe(expected.get(name, DETECTORS[name or "inlier_ratio"]()))
 
 
