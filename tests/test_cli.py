@@ -47,10 +47,10 @@ def test_detector_is_the_one_named_with_options_of_its_own(name, tmp_path, monke
     monkeypatch.setattr(
         "vcjax.commands.simulate.monte_carlo", lambda _, config, **__: seen.append(config) or fake_runs(num_seeds=2)
     )
-    own = {"velocity_glr": ["--threshold", "20", "--innovations", "corrected"], "cusum": ["--drift", "3"]}
+    own = {"velocity_glr": ["--threshold", "20", "--velocity-std-m-s", "1"], "cusum": ["--drift", "3"]}
     named = [] if name is None else ["--detector", name]
     assert main(["simulate", "--gate", "RE", *named, *own.get(name, [])]) == 0
-    expected = {"velocity_glr": vc.VelocityGLR(threshold=20, innovations="corrected"), "cusum": vc.Cusum(3.0)}
+    expected = {"velocity_glr": vc.VelocityGLR(threshold=20, velocity_std_m_s=1.0), "cusum": vc.Cusum(3.0)}
     assert describe(seen[0].detector) == describe(expected.get(name, DETECTORS[name or "inlier_ratio"]()))
 
 
@@ -225,11 +225,11 @@ def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path)
         ([], ["reproduce", "report", "simulate", "track", "record", "inspect", "run", "evaluate"]),
         (["reproduce"], ["--seeds", "--tables", "2 3 4 5", "--out", "--key", "--devices", "the paper: 25"]),
         (["report"], ["PATH", "Directory of an earlier"]),
-        (["simulate", "--gate", "RE"], ["--gate {RE,VC}", "--th1", "--min-searches"]),
+        (["simulate", "--gate", "RE"], ["--gate {RE,VC,one_point_ransac}", "--th1", "--min-searches"]),
         (
             ["simulate"],
             [
-                "--gate {RE,VC}", "--seeds", "--out", "--th1", "--th2", "--prior", "--robot", "--dynamic", "speed, m/s",
+                "--gate {RE,VC,one_point_ransac}", "--seeds", "--out", "--th1", "--th2", "--prior", "--robot", "--dynamic", "speed, m/s",
                 "--oscillation-amplitude-m", "--oscillation-frequency-hz", "Hz, below half the frame rate", "--noise",
                 "step per frame, m", "--num-frames", "--max-landmarks", "--birth-margin-px", "px; at least 0", "1/m",
                 "--min-corrected-ratio", "--mount", "camera in the robot frame", "--intrinsics-px", "--grid-heights-m",

@@ -116,7 +116,7 @@ def followed(following, start, velocity, key):
 def test_velocity_is_consistent_where_measurement_is_linear():
     """Velocities drawn as the model says: the NEES of place and velocity at the end is χ² with 6 degrees of freedom."""
     following, rng, num = (
-        Following(follower_follower_velocity_std_m_s=0.4, velocity_memory_s=2.0),
+        Following(follower_velocity_std_m_s=0.4, velocity_memory_s=2.0),
         np.random.default_rng(1),
         400,
     )

@@ -127,7 +127,7 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
     out.mkdir()
     (out / "robot_tum.txt").write_text("of an earlier run")
     rng, where = np.random.default_rng(0), []
-    for _ in range(6):
+    for _ in range(3):
         child, seen = command(out), len(list(out.glob("unfinished/frames_*")))
         while len(list(out.glob("unfinished/frames_*"))) == seen and child.poll() is None:
             time.sleep(0.002)

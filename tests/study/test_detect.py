@@ -7,7 +7,8 @@ import xarray as xr
 from fake_runs import fake_runs
 
 from vcjax.study import reproduce
-from vcjax.study.detect import METHODS, Scene, detect, pooled, scores
+from vcjax.study.detect import METHODS, detect, pooled, scores
+from vcjax.study.detection_scenes import Scene
 from vcjax.study.paper import Cell
 from vcjax.study.results import attributes
 from vcjax.study.sweep import Experiment

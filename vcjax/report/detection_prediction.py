@@ -13,7 +13,8 @@ from vcjax.detectability.velocity_test import VelocityTest
 from vcjax.gates.velocity_glr import VelocityGLR
 from vcjax.report.markup import grid
 from vcjax.report.style import RC, new_figure
-from vcjax.study.detect import METHODS, Runs, Scene
+from vcjax.study.detect import METHODS, Runs
+from vcjax.study.detection_scenes import Scene
 
 _HALF = 0.5
 """Power at which a mover counts as found when frames are predicted."""

@@ -5,14 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-
+from vcjax.report.detection_figures import found_figure, position_figure
 from vcjax.report.detection_prediction import prediction_figure, prediction_markdown, predictions
+from vcjax.report.detection_roc import roc_figure, separation
 from vcjax.report.markup import grid
-from vcjax.report.style import RC, new_figure, write_figure
+from vcjax.report.style import write_figure
 from vcjax.storage import write_file, write_json
 from vcjax.study.detect import METHODS, MIN_FRAMES_MAPPED, Runs, scores
 from vcjax.study.results import describe
@@ -20,14 +17,14 @@ from vcjax.study.summary import paired_difference
 
 DIFFERENCES = ("position_rmse_cm", "orientation_error_deg")
 """Figures that are compared with the static scene's, seed by seed."""
-_COLOURS = ("#000000", "#e69f00", "#009e73", "#0072b2", "#d55e00", "#cc79a7", "#56b4e9", "#8c8c00")
-_MARKERS = "osD^vPX*"
 _HEADER = (
     "scene",
     "method",
     "movers found, %",
     "static flagged, %",
     "delay, frames",
+    "AUC",
+    "recall at 1 %, %",
     "velocity error, m/s",
     "position, cm",
     "against the static scene, cm",
@@ -37,11 +34,13 @@ _HEADER = (
 _INTRODUCTION = f"""\
 *Movers found*: unique movers flagged of those in the map for at least {MIN_FRAMES_MAPPED} frames or flagged, features
 of all runs pooled, and how many; *static flagged*: static features ever flagged of those ever mapped; *delay*: frames
-from first birth to first deletion of the movers found; *velocity error*: |v̂ − v| of movers when they were flagged, of
-methods that estimate it, and in brackets its NEES / 3; *position*: RMS error of a run; *against the static scene*: the
-difference of it from the same seeds without movers, with its 95 % interval, bold where that excludes zero; *ratio*: of
-the two errors; *ANEES*: of the position, 1 of a consistent filter. ± is a standard error over runs, which is 0 where
-all runs agree. The features that are flagged are those that gate or detector has ever deleted.
+from first birth to first deletion of the movers found; *AUC*, *recall at 1 %*: how well the largest margin that a track
+ever had tells movers from static tracks at all thresholds, and the share of movers found where 1 % of the static tracks
+are called dynamic, with 95 % intervals by bootstrap over seeds; *velocity error*: |v̂ − v| of movers when they were
+flagged, of methods that estimate it, and in brackets its NEES / 3; *position*: RMS error of a run; *against the static
+scene*: the difference of it from the same seeds without movers, with its 95 % interval, bold where that excludes zero;
+*ratio*: of the two errors; *ANEES*: of the position, 1 of a consistent filter. ± is a standard error over runs, which
+is 0 where all runs agree. The features that are flagged are those that gate or detector has ever deleted.
 """
 
 
@@ -55,8 +54,7 @@ def detection_tables(runs: Runs) -> dict[str, Any]:
         `dynamic_speed_m_s`, `amplitude_m` and the `study.detect.scores`. Those with movers have the static scene's
         `static_scene_position_rmse_cm`, and `difference`: by figure of `DIFFERENCES` the `mean` of scene - static scene
         of the same seeds, its 95 % interval `lower` to `upper` and `num_pairs`. `harder_cells` are like them, with the
-        harder scene's name as `label`. Beside them `methods`, the
-        configuration of each, and `num_seeds`.
+        harder scene's name as `label`. Beside them `methods`, the configuration of each, and `num_seeds`.
     """
     cells, harder_cells, static_cells, predicted = [], [], [], predictions(runs)
     for (method, scene), found in runs.items():
@@ -75,7 +73,7 @@ def detection_tables(runs: Runs) -> dict[str, Any]:
             continue
         if scene.dynamic_motion is not None:
             cell["dynamic_set"] = scene.dynamic_set
-        cell |= scores(found, static)
+        cell |= scores(found, static) | separation(found)
         cell["static_scene_position_rmse_cm"] = scores(static, static)["position_rmse_cm"]
         cell["difference"] = _difference(found, static)
         if (method, scene) in predicted:
@@ -124,74 +122,11 @@ def write_detection(runs: Runs, directory: Path) -> list[Path]:
         name = "" if dynamic_set == "ahead" else f"_{dynamic_set}"
         paths += write_figure(found_figure(tables | {"cells": chosen}), directory / "figures" / f"movers_found{name}")
         paths += write_figure(position_figure(tables | {"cells": chosen}), directory / "figures" / f"position{name}")
+    if tables["cells"]:
+        paths += write_figure(roc_figure(runs), directory / "figures" / "roc")
     if predicted := [cell for cell in [*tables["cells"], *tables["harder_cells"]] if "predicted" in cell]:
         paths += write_figure(prediction_figure(predicted), directory / "figures" / "predicted")
     return paths
-
-
-@matplotlib.rc_context(RC)
-def found_figure(tables: dict[str, Any]) -> Figure:
-    """Share of the movers found over their speed, a panel for each motion and amplitude; bars are ± standard errors.
-
-    Of the cells of one set of movers.
-    """
-
-    def draw(axes: Axes, speeds: np.ndarray, cells: list[dict[str, Any]], style: dict[str, Any]) -> None:
-        mean, error = (np.array([100 * cell["found_fraction"][part] for cell in cells]) for part in ("mean", "se"))
-        axes.errorbar(speeds, mean, error, **style)
-        axes.set_ylim(-4, 104)
-
-    return _panels(tables, "movers found, %", draw)
-
-
-@matplotlib.rc_context(RC)
-def position_figure(tables: dict[str, Any]) -> Figure:
-    """What movers add to the position error, over their speed; bars are 95 % intervals, paired by seed."""
-
-    def draw(axes: Axes, speeds: np.ndarray, cells: list[dict[str, Any]], style: dict[str, Any]) -> None:
-        added = [cell["difference"]["position_rmse_cm"] for cell in cells]
-        mean = np.array([each["mean"] for each in added])
-        half_width = np.array([each["upper"] - each["mean"] for each in added])
-        axes.axhline(0, color="#4d4d4d", linewidth=0.8)
-        axes.errorbar(speeds, mean, half_width, **style)
-
-    return _panels(tables, "position error added, cm", draw)
-
-
-def _panels(tables: Mapping[str, Any], label: str, draw) -> Figure:
-    """A row of panels for each motion, a column for each amplitude, a line for each method."""
-    cells = tables["cells"]
-    motions, amplitudes, speeds, methods = (
-        list(dict.fromkeys(cell[name] for cell in cells))
-        for name in ("dynamic_motion", "amplitude_m", "dynamic_speed_m_s", "detector")
-    )
-    figure = new_figure(2.3 * len(amplitudes) + 1.2, 2.2 * len(motions) + 0.8)
-    panels = figure.subplots(len(motions), len(amplitudes), squeeze=False, sharex=True, sharey=True)
-    place = {speed: i for i, speed in enumerate(sorted(speeds))}
-    for row, motion in zip(panels, motions, strict=True):
-        for axes, amplitude in zip(row, amplitudes, strict=True):
-            for i, method in enumerate(methods):
-                chosen = [
-                    cell
-                    for cell in cells
-                    if (cell["dynamic_motion"], cell["amplitude_m"], cell["detector"]) == (motion, amplitude, method)
-                ]
-                style = {"color": _COLOURS[i], "marker": _MARKERS[i], "markersize": 4, "capsize": 2, "label": method}
-                # Side by side, so that equal values are seen.
-                beside = 0.07 * (i - (len(methods) - 1) / 2)
-                at = np.array([place[cell["dynamic_speed_m_s"]] + beside for cell in chosen])
-                draw(axes, at, chosen, style | {"linewidth": 1.2})
-            camera = f"A = {amplitude:g} m" if amplitude else "steady"
-            axes.set_title(f"{motion.replace('_', ' ')}, {camera}")
-            axes.set_xticks(range(len(place)), [f"{speed:g}" for speed in place])
-    for axes in panels[-1]:
-        axes.set_xlabel("speed, m/s")
-    for axes in panels[:, 0]:
-        axes.set_ylabel(label)
-    handles, names = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(names)))
-    figure.suptitle(f"{tables['num_seeds']} runs each", fontsize=10)
-    return figure
 
 
 def _difference(found: Any, static: Any) -> dict[str, Any]:
@@ -215,6 +150,8 @@ def _row(cell: Mapping[str, Any]) -> list[str]:
         found,
         _text(cell["static_flagged_fraction"], 2, 100),
         _text(cell["delay_frames"], 1),
+        _separation(cell, "auc", "{:.3f}", 1),
+        _separation(cell, "recall_at_1_percent", "{:.0f}", 100),
         _velocity(cell),
         _text(cell["position_rmse_cm"], 2),
         "–" if difference is None else _interval(difference),
@@ -229,6 +166,13 @@ def _text(figure: Mapping[str, float], decimals: int, factor: float = 1.0) -> st
     if not math.isfinite(mean):
         return "–"
     return f"{mean:.{decimals}f}" + (f" ± {error:.{decimals}f}" if math.isfinite(error) else "")
+
+
+def _separation(cell: Mapping[str, Any], name: str, form: str, factor: float) -> str:
+    if name not in cell or not math.isfinite(cell[name]["mean"]):
+        return "–"
+    mean, lower, upper = (form.format(factor * cell[name][part]) for part in ("mean", "lower", "upper"))
+    return f"{mean} [{lower}, {upper}]"
 
 
 def _velocity(cell: Mapping[str, Any]) -> str:

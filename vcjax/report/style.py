@@ -28,6 +28,8 @@ RC: Any = {
     "svg.fonttype": "path",
 }
 """Matplotlib's settings."""
+METHOD_COLOURS = ("#000000", "#e69f00", "#009e73", "#0072b2", "#d55e00", "#cc79a7", "#56b4e9", "#8c8c00", "#7f3c8d")
+"""Of the methods of a comparison, in their order."""
 _METADATA = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
 
 

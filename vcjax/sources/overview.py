@@ -90,9 +90,9 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
 
     seen.plot(time_s, np.sum(np.asarray(recording.is_valid), axis=1), color=_BLUE)
     if len(repeated := repeated_frames(tracks)):
-        seen.plot(time_s[repeated], np.zeros(len(repeated)), "|", color=_RED, markersize=12, label="most tracks repeat")
-        seen.legend(loc="lower right", fontsize=8)
-    seen.set(xlabel="time (s)", ylabel="features seen", title="Features in each frame", ylim=(0, None))
+        seen.plot(time_s[repeated], np.zeros(len(repeated)), "|", color=_RED, markersize=12)
+    marked = f"; {len(repeated)} repeat (marked)" if len(repeated) else ""
+    seen.set(xlabel="time (s)", ylabel="features seen", title=f"Features in each frame{marked}", ylim=(0, None))
     if len(length):
         bins = np.unique(np.rint(np.geomspace(1, length.max() + 1, 30))) - 0.5  # whole numbers in each
         lengths.hist(length, bins, color=_BLUE)

@@ -8,7 +8,7 @@ was, and more seeds, methods or scenes extend fewer. All see the same draws of n
 from collections.abc import Callable, Collection, Mapping, Sequence
 from numbers import Integral
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -25,8 +25,9 @@ from vcjax.gates.velocity_glr import VelocityGLR
 from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.gates.windowed_nis import WindowedNIS
-from vcjax.simulation.scenarios import HARDER, DynamicMotion, DynamicSet, RobotMotion, Scenario, harder, paper
+from vcjax.simulation.scenarios import DynamicMotion, DynamicSet
 from vcjax.storage import check_writable, remove_leftovers
+from vcjax.study.detection_scenes import Scene, scenes_of
 from vcjax.study.reproduce import SEEDS_PER_BLOCK, blocks_in, joined_blocks, run_block
 from vcjax.study.results import attributes, load, load_attributes, refuse_other_settings
 from vcjax.study.summary import mean_and_error, per_run
@@ -62,71 +63,6 @@ METHODS: Mapping[str, FilterConfig] = {
 """What is compared, by name: one setting each for all scenes. VC and RE are the paper's, with the deletion rule of its
 toolbox, and so is the field's 1-point RANSAC; the others have the detector's own threshold, correct with more
 landmarks, and flag for good."""
-
-
-class Scene(NamedTuple):
-    """Where a method is run: what moves, how fast, and how the camera swings."""
-
-    amplitude_m: float
-    """A of the oscillation, m; 0: steady."""
-    dynamic_motion: DynamicMotion | None = None
-    """None: nothing moves."""
-    dynamic_speed_m_s: float | None = None
-    robot: RobotMotion = "forward"
-    dynamic_set: DynamicSet = "ahead"
-    """Which features move."""
-    harder: str | None = None
-    """Name of a scene of `scenarios.HARDER` instead, which says what moves, and how."""
-    oscillation_error_std_m: float = 0.0
-    """How far the camera is from where it should be in a static scene, m."""
-
-    @property
-    def is_static(self) -> bool:
-        """Whether nothing moves."""
-        return self.dynamic_motion is None and self.harder is None
-
-    @property
-    def label(self) -> str:
-        """In words, without the amplitude: e.g. "inverse forward, 0.5 m/s"."""
-        if self.harder is not None:
-            return self.harder.replace("_", " ")
-        if self.dynamic_motion is None:
-            error = self.oscillation_error_std_m
-            return f"static, robot {self.robot}" + (f", oscillation ± {1000 * error:g} mm" if error else "")
-        near = "" if self.dynamic_set == "ahead" else f", {self.dynamic_set.replace('_', ' ')}"
-        return f"{self.dynamic_motion.replace('_', ' ')}, {self.dynamic_speed_m_s:g} m/s{near}"
-
-    @property
-    def identifier(self) -> str:
-        """As a file name."""
-        parts = [f"A_{self.amplitude_m!r}", self.robot, self.harder or self.dynamic_motion or "static"]
-        if self.dynamic_speed_m_s is not None:
-            parts.append(f"{self.dynamic_speed_m_s!r}_m_s")
-        if self.dynamic_set != "ahead":
-            parts.append(self.dynamic_set)
-        if self.oscillation_error_std_m:
-            parts.append(f"error_{self.oscillation_error_std_m!r}")
-        return "_".join(parts)
-
-    @property
-    def static(self) -> "Scene":
-        """The same without movers."""
-        error = HARDER.get(self.harder or "", {}).get("oscillation_error_std_m", self.oscillation_error_std_m)
-        return Scene(self.amplitude_m, robot=self.robot, oscillation_error_std_m=error)
-
-    def scenario(self, num_frames: int) -> Scenario:
-        """The scenario, as `scenarios` makes and checks it."""
-        if self.harder is not None:
-            return harder(self.harder, oscillation_amplitude_m=self.amplitude_m, num_frames=num_frames)
-        return paper(
-            robot=self.robot,
-            dynamic=self.dynamic_motion,
-            dynamic_speed_m_s=self.dynamic_speed_m_s or 0.0,
-            dynamic_set=self.dynamic_set,
-            oscillation_amplitude_m=self.amplitude_m,
-            oscillation_error_std_m=self.oscillation_error_std_m,
-            num_frames=num_frames,
-        )
 
 
 Runs = dict[tuple[str, Scene], Any]
@@ -174,7 +110,7 @@ def detect(
         raise ValueError(f"detect(num_seeds={num_seeds!r}): give at least one seed, a whole number.")
     if isinstance(methods, str) or not methods or not set(methods) <= set(METHODS):
         raise ValueError(f"detect(methods={methods!r}): give at least one of {', '.join(METHODS)}.")
-    scenes = _scenes(amplitudes_m, motions, speeds_m_s, dynamic_sets, harder_scenes)
+    scenes = scenes_of(amplitudes_m, motions, speeds_m_s, dynamic_sets, harder_scenes)
     scenarios = {scene: scene.scenario(num_frames) for scene in scenes}
     # Method by method, since each compiles once.
     experiments = {(name, scene): Experiment(scenarios[scene], METHODS[name]) for name in METHODS for scene in scenes}
@@ -262,39 +198,6 @@ def pooled(part: np.ndarray, whole: np.ndarray) -> dict[str, float]:
     ratio = float(np.sum(part)) / total
     square = float(np.sum((part - ratio * whole) ** 2))
     return {"mean": ratio, "se": np.sqrt(num / (num - 1) * square) / total if num > 1 else np.nan}
-
-
-def _scenes(amplitudes_m, motions, speeds_m_s, dynamic_sets, harder_scenes) -> list[Scene]:
-    """All scenes, amplitude by amplitude, static ones last."""
-    given = {"amplitudes_m": amplitudes_m, "motions": motions, "speeds_m_s": speeds_m_s, "dynamic_sets": dynamic_sets}
-    for name, values in given.items():
-        if isinstance(values, str) or not values or len(set(values)) < len(values):
-            raise ValueError(f"detect({name}={values!r}): give at least one, each once, in a list.")
-    if (
-        isinstance(harder_scenes, str)
-        or len(set(harder_scenes)) < len(harder_scenes)
-        or set(harder_scenes) - set(HARDER)
-    ):
-        raise ValueError(f"detect(harder_scenes={harder_scenes!r}): give some of {', '.join(HARDER)}, each once.")
-    if not all(np.isfinite(v) and v > 0 for v in speeds_m_s):
-        raise ValueError(f"detect(speeds_m_s={tuple(speeds_m_s)}): give positive speeds; the static scenes come along.")
-    robots: tuple[RobotMotion, ...] = ("forward", "curved", "lateral")
-    scenes = [
-        scene
-        for a in map(float, amplitudes_m)
-        for scene in (
-            *(
-                Scene(a, motion, float(v), dynamic_set=s)
-                for s in dynamic_sets
-                for motion in motions
-                for v in speeds_m_s
-            ),
-            *(Scene(a, harder=name) for name in harder_scenes),
-            *(Scene(a, robot=robot) for robot in robots),
-            *(Scene(a, harder=name).static for name in harder_scenes),
-        )
-    ]
-    return list(dict.fromkeys(scenes))
 
 
 def _mean(values: xr.DataArray) -> dict[str, float]:
