@@ -172,3 +172,5 @@ def test_the_landscape_shows_every_mean_in_its_place(choice):
     assert landscape_figure(linear, "title").axes[0].get_xlim() == (0.5, 3.5)
     two = landscape_figure(grid.isel({TH1: [0, 2]}).isel({TH2: [1, 2]}), "title").axes[0]
     assert (two.get_xscale(), two.get_yscale()) == ("log", "linear") and two.get_xlim() == pytest.approx((2, 32))
+    far = grid.isel({TH1: [0, 2]}).assign_coords({TH1: [2.0, 64.0]})
+    assert landscape_figure(far, "title").axes[0].get_xlim() == pytest.approx((2 / 32**0.5, 64 * 32**0.5))

@@ -103,7 +103,7 @@ def test_bad_input_is_refused_before_any_work(monkeypatch, unchecked):
         ({"settings": {"config.gate.th3": [1.0]}}, "no numeric leaf 'config.gate.th3'; choose among"),
         ({"settings": {"config.gate.th1": [9.0, -1.0]}}, r"th1=-1.0\)"),
         ({"settings": {"scenario.oscillation.frequency_hz": [6.0]}}, "not below half the frame rate"),
-        ({"num_seeds": 0}, r"num_seeds=0\): give at least one seed"),
+        ({"num_seeds": 0}, r"num_seeds=0\): give a whole number of at least 1"),
         ({"num_seeds": True}, r"num_seeds=True\)"),
         ({"scenarios": [tiny_runs.scenario()] * 3}, r"evaluate\(scenarios=<list>\): give at least one scene"),
         ({"settings": [1.0]}, r"evaluate\(settings=\[1.0\]\): give at least one path"),

@@ -83,10 +83,11 @@ def _edges(values: np.ndarray) -> np.ndarray:
     """Ends of the cells around values, half-way between them on the axis that they are drawn on."""
     if len(values) < 2:
         return values[0] + np.array([-0.5, 0.5])
-    if _is_log(values):
-        return np.exp(_edges(np.log(values)))
-    middle = (values[1:] + values[:-1]) / 2
-    return np.concatenate([[2 * values[0] - middle[0]], middle, [2 * values[-1] - middle[-1]]])
+    is_log = _is_log(values)
+    places = np.log(values) if is_log else values
+    middle = (places[1:] + places[:-1]) / 2
+    edges = np.concatenate([[2 * places[0] - middle[0]], middle, [2 * places[-1] - middle[-1]]])
+    return np.exp(edges) if is_log else edges
 
 
 def _scale(axes: Axes, x: np.ndarray, y: np.ndarray) -> None:
