@@ -229,7 +229,8 @@ def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path)
         (
             ["simulate"],
             [
-                "--gate {RE,VC,one_point_ransac}", "--seeds", "--out", "--th1", "--th2", "--prior", "--robot", "--dynamic", "speed, m/s",
+                "--gate {RE,VC,one_point_ransac}", "--seeds", "--out", "--th1", "--th2", "--prior", "--robot",
+                "--dynamic", "speed, m/s",
                 "--oscillation-amplitude-m", "--oscillation-frequency-hz", "Hz, below half the frame rate", "--noise",
                 "step per frame, m", "--num-frames", "--max-landmarks", "--birth-margin-px", "px; at least 0", "1/m",
                 "--min-corrected-ratio", "--mount", "camera in the robot frame", "--intrinsics-px", "--grid-heights-m",
