@@ -140,7 +140,7 @@ def test_nothing_is_expected_of_a_gate_that_accepts_jointly(info):
     filtered = Filtered(info, LastPlaces(np.array([4, 7]), np.zeros((2, 3)), np.zeros((2, 3, 3))), 12.5, 0.2)
     recording = SimpleNamespace(time_s=np.array([10.0, 10.5, 12.0]), num_frames=3)
     config = vc.FilterConfig(gate=vc.OnePointRansac())
-    found = run_summary(config, recording, filtered, track_verdicts(verdicts(info)))
+    found = run_summary(config, recording, filtered, track_verdicts(verdicts(info), info))
     assert all(math.isnan(found[name]) for name in ("nis_low", "nis_high", "beyond_gate_expected"))
     assert found["nis"] == pytest.approx(2.0) and found["beyond_gate"] == pytest.approx(0.5)
     text = run_summary_text(found)

@@ -28,8 +28,7 @@ from tiny_runs import (
 
 import vcjax as vc
 from vcjax.study import monte_carlo as module
-from vcjax.study.metrics import run_metrics
-from vcjax.study.monte_carlo import monte_carlo, run_one
+from vcjax.study.monte_carlo import metrics_of, monte_carlo, run_one
 from vcjax.study.results import PER_FEATURE, PER_FRAME, PER_RUN, attributes
 from vcjax.study.summary import summarise
 from vcjax.study.sweep import Experiment
@@ -49,7 +48,7 @@ def test_equals_single_runs_one_after_another():
     for seed in range(NUM_SEEDS):
         recording, truth = simulate_once(scenario, jax.random.fold_in(KEY, seed))
         _, info = run_once(config, recording)
-        single = run_metrics(info, truth)
+        single = metrics_of(Experiment(scenario, config), info, truth)
         assert set(single) == set(MEASURES)
         found = runs.isel(seed=seed)
         assert_same_runs(found, single, **ROUNDING)

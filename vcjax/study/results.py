@@ -149,7 +149,7 @@ def refuse_other_settings(path: str | os.PathLike, found: Mapping[str, Any], exp
 
 
 def _short(value: Any) -> str:
-    text = json.dumps(value)
+    text = json.dumps(value, default=lambda number: number.item())  # what comes from a file has types of its own
     return text if len(text) < 60 else text[:57] + "..."
 
 
