@@ -52,7 +52,7 @@ from vcjax.study.detect import METHODS, detect
 SPEED_M_S, A_M = 0.5, 0.1
 THRESHOLD = 17.0
 FILTER = METHODS["RE+velocity_glr"]
-assert FILTER.detector.threshold == THRESHOLD
+assert isinstance(FILTER.detector, vc.VelocityGLR) and FILTER.detector.threshold == THRESHOLD
 steady, swinging = (
     vc.scenarios.paper(dynamic="inverse_forward", dynamic_speed_m_s=SPEED_M_S, oscillation_amplitude_m=a)
     for a in (0.0, A_M)
@@ -208,18 +208,18 @@ for cell in sorted(tables["cells"], key=lambda cell: (cell["label"], cell["ampli
     )
 
 
-def cell(method, motion, amplitude_m):
+def scores_of(method, motion, amplitude_m):
     """Scores of a method in a scene."""
     wanted = (method, motion, amplitude_m)
     return next(c for c in tables["cells"] if (c["detector"], c["dynamic_motion"], c["amplitude_m"]) == wanted)
 
 
-test_cell = cell("RE+velocity_glr", "inverse_forward", A_M)
+test_cell = scores_of("RE+velocity_glr", "inverse_forward", A_M)
 predicted_frames = predicted["swinging"].frames_needed.mean()
 print(f"frames to detection: predicted {predicted_frames:.0f}, measured {test_cell['delay_frames']['mean']:.0f}")
 assert test_cell["found_fraction"]["mean"] > 0.95
 assert all(c["static_flagged_fraction"]["mean"] < 0.02 for c in tables["cells"] if c["detector"] == "RE+velocity_glr")
-assert cell("RE+velocity_glr", "inverse_forward", 0.0)["found_fraction"]["mean"] < 0.2
+assert scores_of("RE+velocity_glr", "inverse_forward", 0.0)["found_fraction"]["mean"] < 0.2
 assert abs(predicted_frames - test_cell["delay_frames"]["mean"]) < 12
 
 # %% [markdown]

@@ -59,7 +59,7 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     for path in (folder / "descents").iterdir():
         path.unlink()  # the steps were lost: what they led to is found beside them
     assert main([*arguments, "--position", "3"]) == 1
-    assert_one_line(said(capsys)[1], "candidates", "other settings (objective: ")
+    assert_one_line(said(capsys)[1], "settings_00000-", "other settings (objective: ")
 
 
 def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):

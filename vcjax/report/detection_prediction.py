@@ -39,8 +39,9 @@ def predictions(runs: Runs) -> dict[tuple[str, Scene], dict[str, float]]:
     result = {}
     for (method, scene), found in runs.items():
         detector = METHODS[method].detector
-        is_predicted = isinstance(detector, VelocityGLR) and detector.threshold is not None
-        if not is_predicted or scene.is_static or scene.harder is not None:
+        if not isinstance(detector, VelocityGLR) or detector.threshold is None:
+            continue
+        if scene.is_static or scene.harder is not None:
             continue
         test = VelocityTest(false_alarm_rate=float(survival(detector.threshold)))
         scenario = scene.scenario(found.sizes["frame"])

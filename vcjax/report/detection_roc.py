@@ -52,7 +52,8 @@ def roc_figure(runs: Runs) -> Figure:
     The tracks of the scenes with movers are pooled, the harder scenes left out.
     """
     pooled = _pooled(runs)
-    amplitudes, methods = (list(dict.fromkeys(key[i] for key in pooled)) for i in (0, 1))
+    amplitudes = list(dict.fromkeys(amplitude for amplitude, _ in pooled))
+    methods = list(dict.fromkeys(method for _, method in pooled))
     figure = new_figure(7.2, 2.5 * len(amplitudes) + 0.7)
     panels = figure.subplots(len(amplitudes), 2, squeeze=False)
     for (left, right), amplitude in zip(panels, amplitudes, strict=True):

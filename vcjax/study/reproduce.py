@@ -40,7 +40,7 @@ from vcjax.study.sweep import Experiment
 SEEDS_PER_BLOCK = 25
 OSCILLATION_AMPLITUDE_M = 0.05
 """A of the paper's oscillating camera (Table 1)."""
-GATES: Mapping[str, Callable[[], AbstractGate]] = {
+GATES: Mapping[str, Callable[[], AbstractGate]] = {  # pyright: ignore[reportAssignmentType] (prior is a property)
     "RE": ReprojectionError,
     "VC": VirtualCorrection,
     "one_point_ransac": OnePointRansac,

@@ -216,8 +216,16 @@ def _average(
         mean, error = figures.mean(axis=0), np.sqrt(_variance(figures, scenes) / len(figures))
     else:
         mean = error = np.full(1 + len(parameters), np.nan)
-    by_parameter = (dict(zip(parameters, each.tolist(), strict=True)) for each in (mean[1:], error[1:], weight))
-    return Step(parameters, temperature, float(mean[0]), float(error[0]), *by_parameter, int((~is_finite).sum()))
+    return Step(
+        parameters,
+        temperature,
+        loss=float(mean[0]),
+        loss_se=float(error[0]),
+        gradient=dict(zip(parameters, mean[1:].tolist(), strict=True)),
+        gradient_se=dict(zip(parameters, error[1:].tolist(), strict=True)),
+        pathwise=dict(zip(parameters, weight.tolist(), strict=True)),
+        num_failed=int((~is_finite).sum()),
+    )
 
 
 def _variance(values: np.ndarray, scenes: np.ndarray) -> np.ndarray:
