@@ -58,9 +58,9 @@ def roc_figure(runs: Runs) -> Figure:
     panels = figure.subplots(len(amplitudes), 2, squeeze=False)
     for (left, right), amplitude in zip(panels, amplitudes, strict=True):
         for method, colour in zip(methods, METHOD_COLOURS, strict=False):
-            tracks = pooled[amplitude, method]
-            _draw(left, roc.FALSE_RATES, roc.recall_at, tracks, method, colour)
-            _draw(right, roc.RECALLS, roc.precision_at, tracks, method, colour)
+            if (tracks := pooled.get((amplitude, method))) is not None:
+                _draw(left, roc.FALSE_RATES, roc.recall_at, tracks, method, colour)
+                _draw(right, roc.RECALLS, roc.precision_at, tracks, method, colour)
         left.axvline(FALSE_RATE, color="#b3b3b3", linewidth=0.8, linestyle=":")
         left.set(xscale="log", xlim=(roc.FALSE_RATES[0], 1), ylim=(0, 1.02), ylabel="movers found")
         right.set(xlim=(0, 1), ylim=(0, 1.02), ylabel="precision")

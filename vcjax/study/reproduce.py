@@ -40,10 +40,10 @@ from vcjax.study.sweep import Experiment
 SEEDS_PER_BLOCK = 25
 OSCILLATION_AMPLITUDE_M = 0.05
 """A of the paper's oscillating camera (Table 1)."""
-GATES: Mapping[str, Callable[[], AbstractGate]] = {  # pyright: ignore[reportAssignmentType] (prior is a property)
+GATES: Mapping[str, Callable[[], AbstractGate]] = {
     "RE": ReprojectionError,
     "VC": VirtualCorrection,
-    "one_point_ransac": OnePointRansac,
+    "one_point_ransac": lambda: OnePointRansac(),  # pyright: ignore[reportCallIssue] (prior is a property)
 }
 """The gates by name; the paper has the first two."""
 DETECTORS: Mapping[str, Callable[[], AbstractDetector]] = {
