@@ -158,9 +158,9 @@ for axes, info, name in zip(panels, infos, ("steady", "swinging"), strict=True):
     axes.plot(frame, v, color="#d55e00")
     axes.set(xlabel="frame", title=f"{name} camera", ylim=(-1.6, 1.1))
 _ = panels[0].set_ylabel("velocity along the path, m/s")
-assert abs(end["swinging"][0] + SPEED_M_S / 2) < 0.05 < 4 * end["swinging"][1]
 for name, (v, std) in end.items():
     print(f"{name}: v = {v:+.2f} ± {std:.2f} m/s, true −{SPEED_M_S:.2f}")
+assert 0.2 * SPEED_M_S < -end["swinging"][0] < 0.75 * SPEED_M_S
 
 # %% [markdown]
 # The test is sure that the mover comes, and wrong about how fast: −0.23 m/s instead of −0.5. Until now the filter has
