@@ -63,7 +63,7 @@ def prediction_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
             f"{cell['label']}, " + (f"A = {cell['amplitude_m']:g} m" if cell["amplitude_m"] else "steady"),
             cell["detector"],
             f"{100 * predicted['found_fraction']:.1f}",
-            f"{100 * found['mean']:.1f} ± {100 * found['se']:.1f}",
+            _number(100 * found["mean"], "{:.1f}") + _number(100 * found["se"], " ± {:.1f}", instead=""),
             _number(predicted["delay_frames"], "{:.0f}"),
             _number(delay["mean"], "{:.1f}"),
         ]
@@ -102,5 +102,5 @@ def prediction_figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _number(value: float, form: str) -> str:
-    return form.format(value) if np.isfinite(value) else "–"
+def _number(value: float, form: str, instead: str = "–") -> str:
+    return form.format(value) if np.isfinite(value) else instead
