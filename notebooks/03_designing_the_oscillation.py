@@ -339,14 +339,14 @@ motion = [0.5 * (2 * np.pi * setting[F] * setting[A]) ** 2 for setting in (befor
 print(f"camera motion           {motion[0]:6.2f} → {motion[1]:6.2f} m²/s²")
 paired = compared["paired"][ALL]
 assert after[A] > 0.07 and paired["loss"]["upper"] < -0.05
-assert paired["dynamic_found_per_run"]["lower"] > 0.5 and paired["position_rmse_cm"]["upper"] < 0
+assert paired["dynamic_found_per_run"]["lower"] > 0.5 and paired["position_rmse_cm"]["mean"] < 0
 assert paired["static_deleted_per_run"]["mean"] < 1 and motion[1] > motion[0]
 assert round(0.02 * motion[0], 3) == 0.009
 
 # %% [markdown]
-# More movers are found and the position error falls, both by more than their intervals, and hardly a static feature is
-# paid for it. The price is motion, and more of it. That is a choice of the objective, whose weight makes the
-# paper's oscillation cost no more than 0.009 of F1.
+# More movers are found, by more than the interval, and hardly a static feature is paid for it; whether the position
+# error falls is not decided by so few runs. The price is motion, and more of it. That is a choice of the objective,
+# whose weight makes the paper's oscillation cost no more than 0.009 of F1.
 #
 # But the price grows with A·f, and what is seen with A alone. So the same motion as before can be had with the tuned
 # amplitude and a lower frequency:
