@@ -339,7 +339,8 @@ motion = [0.5 * (2 * np.pi * setting[F] * setting[A]) ** 2 for setting in (befor
 print(f"camera motion           {motion[0]:6.2f} → {motion[1]:6.2f} m²/s²")
 paired = compared["paired"][ALL]
 assert after[A] > 0.07 and paired["loss"]["upper"] < -0.05
-assert paired["dynamic_found_per_run"]["lower"] > 0.5 and paired["position_rmse_cm"]["mean"] < 0
+assert paired["dynamic_found_per_run"]["lower"] > 0.5
+assert paired["position_rmse_cm"]["lower"] < 0 < paired["position_rmse_cm"]["upper"]
 assert paired["static_deleted_per_run"]["mean"] < 1 and motion[1] > motion[0]
 assert round(0.02 * motion[0], 3) == 0.009
 

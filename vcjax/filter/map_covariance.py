@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-SLOT = 7
-"""Error coordinates of a landmark slot."""
+from vcjax.gates.gate import SLOT as SLOT
+
 SLOTS_PER_BLOCK = 12
 """Slots along the side of a tile."""
 TILE = SLOT * SLOTS_PER_BLOCK

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 SLOT = 7
-"""Error coordinates of a slot."""
+"""Error coordinates of a landmark slot."""
 Prior = Literal["corrected", "predicted"]
 PRIORS = ("corrected", "predicted")
 

@@ -51,16 +51,13 @@ class OnePointRansac(AbstractJointGate):
     2.4 px for pixels of 1 px); positive."""
     th_rescue: float = eqx.field(converter=number, default=5.99)
     """What RE₁ may be after the partial update, a χ² value with 2 degrees of freedom (5.99 is 95 %); positive."""
+    prior: Prior = eqx.field(static=True, default="corrected", init=False)
+    """The rescue is at the corrected state."""
     condemns: ClassVar[bool] = False
 
     def __check_init__(self):
         for name in ("th1", "th_consensus", "th_rescue"):
             require(self, name, lambda th: th > 0, "a threshold on a squared distance is positive (5.99 is 95 %).")
-
-    @property
-    def prior(self) -> Prior:  # type: ignore[override]
-        """The rescue is at the corrected state."""
-        return "corrected"
 
     def margin(self, re1: Float[Array, "..."]) -> Float[Array, "..."]:
         """Th₁ - RE₁, of the search region."""

@@ -22,13 +22,10 @@ def curves_figure(choice: Choice) -> Figure:
     figure = new_figure(7.2, 3.6)
     left, right = figure.subplots(1, 2)
     for tracks, (side, style) in zip(_tracks(choice), _STYLES.items(), strict=True):
-        _draw(left, roc.FALSE_RATES, roc.recall_at, tracks[ALL], side, style)
-        _draw(right, roc.RECALLS, roc.precision_at, tracks[ALL], side, style)
-    _roc_axes(left)
-    right.set_xlabel("recall: movers found")
-    right.set_ylabel("precision")
-    right.set_xlim(0, 1)
-    right.set_ylim(0, 1.02)
+        draw_curve(left, roc.FALSE_RATES, roc.recall_at, tracks[ALL], side, style)
+        draw_curve(right, roc.RECALLS, roc.precision_at, tracks[ALL], side, style)
+    roc_axes(left)
+    precision_axes(right)
     seeds, scenes = choice.held_out.sizes["seed"], choice.held_out.sizes["scene"]
     of = f"{scenes} scenes × {seeds}" if scenes > 1 else str(seeds)
     _finish(figure, left, f"Tracks of {of} held-out runs, 95 % bands")
@@ -48,8 +45,8 @@ def roc_by_scene_figure(choice: Choice) -> Figure:
         axes.remove()
     for axes, name in zip(panels.flat, names, strict=False):
         for tracks, (side, style) in zip((before, after), _STYLES.items(), strict=True):
-            _draw(axes, roc.FALSE_RATES, roc.recall_at, tracks[name], side, style)
-        _roc_axes(axes)
+            draw_curve(axes, roc.FALSE_RATES, roc.recall_at, tracks[name], side, style)
+        roc_axes(axes)
         axes.set_title(name)
         axes.label_outer()
     title = f"ROC over the tracks of {choice.held_out.sizes['seed']} held-out runs, 95 % bands"
@@ -62,13 +59,23 @@ def _tracks(choice: Choice) -> list[dict[str, roc.Tracks]]:
     return [tracks_of(choice.held_out.isel(setting=i)) for i in (0, 1)]
 
 
-def _draw(axes: Axes, levels: np.ndarray, curve, tracks: roc.Tracks, side: str, style: dict) -> None:
+def draw_curve(axes: Axes, levels: np.ndarray, curve, tracks: roc.Tracks, label: str, style: dict) -> None:
+    """`roc.recall_at` or `precision_at` with its pointwise 95 % band by bootstrap over seeds."""
     low, high = roc.interval(roc.resampled(curve, tracks, levels, _RESAMPLES))
-    axes.plot(levels, curve(tracks, levels)[0], label=side, **style)
+    axes.plot(levels, curve(tracks, levels)[0], label=label, **style)
     axes.fill_between(levels, low, high, color=style["color"], alpha=0.18, linewidth=0)
 
 
-def _roc_axes(axes: Axes) -> None:
+def precision_axes(axes: Axes) -> None:
+    """Axes of precision over recall."""
+    axes.set_xlim(0, 1)
+    axes.set_ylim(0, 1.02)
+    axes.set_xlabel("recall: movers found")
+    axes.set_ylabel("precision")
+
+
+def roc_axes(axes: Axes) -> None:
+    """Axes of the ROC, with a line at the share of static tracks at which recall is told."""
     axes.axvline(FALSE_RATE, color="#b3b3b3", linewidth=0.8, linestyle=":")
     axes.set_xscale("log")
     axes.set_xlim(roc.FALSE_RATES[0], 1)

@@ -5,19 +5,18 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vcjax.report.detection_curves import draw_curve, precision_axes, roc_axes
 from vcjax.report.style import METHOD_COLOURS, RC, new_figure
 from vcjax.study import roc
 from vcjax.study.detect import Runs
+from vcjax.tuning.choice import FALSE_RATE
 
-FALSE_RATE = 0.01
-"""Share of the static tracks called dynamic at which recall is told."""
 _RESAMPLES = 200
 
 
-def tracks_of(runs: Any) -> roc.Tracks:
+def _tracks(runs: Any) -> roc.Tracks:
     """The tracks of one method in one scene, by what deletes them (see `roc.track_scores`)."""
     score = roc.track_scores(runs).transpose("seed", "feature")
     return roc.Tracks(score.values, np.broadcast_to(runs.is_moving.values, score.shape))
@@ -29,7 +28,7 @@ def separation(runs: Any) -> dict[str, dict[str, float]]:
     Returns: `auc`, and `recall_at_1_percent`, the share of movers found when 1 % of the static tracks are called
         dynamic; each with the 95 % interval `lower` to `upper` by bootstrap over seeds.
     """
-    tracks = tracks_of(runs)
+    tracks = _tracks(runs)
     weights = roc.resamples(len(tracks.score), _RESAMPLES)
     rate = np.array([FALSE_RATE])
     return {
@@ -59,15 +58,13 @@ def roc_figure(runs: Runs) -> Figure:
     for (left, right), amplitude in zip(panels, amplitudes, strict=True):
         for method, colour in zip(methods, METHOD_COLOURS, strict=False):
             if (tracks := pooled.get((amplitude, method))) is not None:
-                _draw(left, roc.FALSE_RATES, roc.recall_at, tracks, method, colour)
-                _draw(right, roc.RECALLS, roc.precision_at, tracks, method, colour)
-        left.axvline(FALSE_RATE, color="#b3b3b3", linewidth=0.8, linestyle=":")
-        left.set(xscale="log", xlim=(roc.FALSE_RATES[0], 1), ylim=(0, 1.02), ylabel="movers found")
-        right.set(xlim=(0, 1), ylim=(0, 1.02), ylabel="precision")
+                style = {"color": colour, "linewidth": 1.2}
+                draw_curve(left, roc.FALSE_RATES, roc.recall_at, tracks, method, style)
+                draw_curve(right, roc.RECALLS, roc.precision_at, tracks, method, style)
+        roc_axes(left)
+        precision_axes(right)
         for axes in (left, right):
             axes.set_title(f"A = {amplitude:g} m" if amplitude else "steady")
-    panels[-1, 0].set_xlabel("static tracks called dynamic")
-    panels[-1, 1].set_xlabel("recall: movers found")
     handles, names = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(names)))
     figure.suptitle("Tracks of all scenes with movers, at every threshold, 95 % bands", fontsize=10)
@@ -79,14 +76,8 @@ def _pooled(runs: Runs) -> Mapping[tuple[float, str], roc.Tracks]:
     parts: dict[tuple[float, str], list[roc.Tracks]] = {}
     for (method, scene), found in runs.items():
         if scene.dynamic_motion is not None:
-            parts.setdefault((scene.amplitude_m, method), []).append(tracks_of(found))
+            parts.setdefault((scene.amplitude_m, method), []).append(_tracks(found))
     return {
         key: roc.Tracks(*(np.concatenate([part[i] for part in each], axis=1) for i in (0, 1)))
         for key, each in parts.items()
     }
-
-
-def _draw(axes: Axes, levels: np.ndarray, curve, tracks: roc.Tracks, label: str, colour: str) -> None:
-    low, high = roc.interval(roc.resampled(curve, tracks, levels, _RESAMPLES))
-    axes.plot(levels, curve(tracks, levels)[0], label=label, color=colour, linewidth=1.2)
-    axes.fill_between(levels, low, high, color=colour, alpha=0.15, linewidth=0)

@@ -52,7 +52,7 @@ _GLR = VelocityGLR(threshold=17.0)
 METHODS: Mapping[str, FilterConfig] = {
     "VC": FilterConfig(gate=VirtualCorrection()),
     "RE": FilterConfig(gate=ReprojectionError()),
-    "one_point_ransac": FilterConfig(gate=OnePointRansac()),  # pyright: ignore[reportCallIssue] (prior is a property)
+    "one_point_ransac": FilterConfig(gate=OnePointRansac()),
     "RE+velocity_glr": _with(ReprojectionError(), _GLR),
     "VC+velocity_glr": _with(VirtualCorrection(), _GLR),
     "RE+velocity_likelihood_ratio": _with(ReprojectionError(th1=_WIDE_TH1), VelocityLikelihoodRatio()),

@@ -43,7 +43,7 @@ OSCILLATION_AMPLITUDE_M = 0.05
 GATES: Mapping[str, Callable[[], AbstractGate]] = {
     "RE": ReprojectionError,
     "VC": VirtualCorrection,
-    "one_point_ransac": lambda: OnePointRansac(),  # pyright: ignore[reportCallIssue] (prior is a property)
+    "one_point_ransac": OnePointRansac,
 }
 """The gates by name; the paper has the first two."""
 DETECTORS: Mapping[str, Callable[[], AbstractDetector]] = {

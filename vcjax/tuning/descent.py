@@ -79,6 +79,10 @@ class Schedule(eqx.Module):
         return optax.novograd(rates, *_MEMORY)
 
 
+class NotFinite(ValueError):
+    """An objective that is not a number where a descent is to begin."""
+
+
 class Step(NamedTuple):
     """One step: where it was taken, and what was found there."""
 
@@ -120,7 +124,7 @@ def descend(
     Returns: every step. Equal arguments give equal steps, wherever the work was stopped in between.
 
     Raises:
-        ValueError: if the objective is not finite at the start.
+        NotFinite: if the objective is not finite at the start.
     """
     require_key("descend", key)
     history, optimiser = list(history), schedule.optimiser()
@@ -139,7 +143,7 @@ def descend(
         runs = run_lanes(work, lanes, seeds, jax.random.fold_in(key, k))
         step = _average(runs, lanes["scene"][::2], problem.to_parameters(free), temperature, spread)
         if not history and not np.isfinite(step.loss):
-            raise ValueError(f"the objective is not finite at the start, {step.parameters}; start elsewhere.")
+            raise NotFinite(f"the objective is not finite at the start, {step.parameters}; start elsewhere.")
         history.append(step)
         free, state = _move(optimiser, free, state, step)
         if progress is not None:

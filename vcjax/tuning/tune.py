@@ -23,7 +23,7 @@ from vcjax.storage import check_writable, with_nulls, write_json
 from vcjax.study.results import describe, import_xarray, provenance, refuse_other_settings
 from vcjax.tuning.blocks import as_directory
 from vcjax.tuning.choice import Choice, Seeds, Setting, check_directory, choose, setting_of
-from vcjax.tuning.descent import Schedule, Step, descend, end_of
+from vcjax.tuning.descent import NotFinite, Schedule, Step, descend, end_of
 from vcjax.tuning.intervals import Interval
 from vcjax.tuning.losses import Objective
 from vcjax.tuning.problem import Problem, problem_of
@@ -127,9 +127,9 @@ def tune(
             try:
                 descents.append(descend(problem, start, schedule, key=own_key, history=history, progress=told))
                 continue
-            except ValueError as error:
+            except NotFinite:
                 # Where the parameters are, this is for the user to know; elsewhere it is one start less.
-                if number == 0 or "not finite at the start" not in str(error):
+                if number == 0:
                     raise
             kept[number].write(None)
         left_out.append(start)
