@@ -220,7 +220,7 @@ def broken_at(*starts: int):
     def descend(problem, start, schedule, *, key, history, progress):
         begun.append(dict(start))
         if len(begun) - 1 in starts:
-            raise ValueError(f"the objective is not finite at the start, {start}; start elsewhere.")
+            raise descent.NotFinite(f"the objective is not finite at the start, {start}; start elsewhere.")
         nan = dict.fromkeys(start, np.nan)
         steps = list(history) or [
             descent.Step(dict(start), 1.0, 0.5, np.nan, dict.fromkeys(start, 0.1), {}, {}, 1),
