@@ -161,7 +161,8 @@ def _by_tracks(filtered: Filtered, cut: CutRecording) -> Filtered:
     """What the filter says of pieces of tracks, said of the tracks of the file."""
 
     def ids(info):
-        return info.candidate_id, info.watched_id, info.inconsistent_id, info.born_id, info.track_id
+        found = info.candidate_id, info.watched_id, info.inconsistent_id, info.born_id, info.track_id
+        return found if info.followers is None else (*found, info.followers.track_id, info.handed_back_id)
 
     info = eqx.tree_at(ids, filtered.info, jax.tree.map(cut.track_of, ids(filtered.info)))
     landmarks = filtered.landmarks

@@ -7,6 +7,7 @@
 | `landmarks.ply`, `landmarks.csv` | every landmark's last place, class and covariance; see `map_file.py` |
 | `verdicts.csv` | frame, track_id, re1, re2, margin, verdict: a row for each measured candidate and each deletion |
 | `tracks.csv` | how often each verdict was passed on each track, its largest margin and the detector's |
+| `followers.csv` | frame, track_id, x, y, z (m), vx, vy, vz (m/s) and their covariance, of what is followed |
 | `summary.json` | the numbers of `run_summary`, and what they come from; written last |
 
 Tables are CSV or Parquet. In columns re1, re2 and of margins nan stands where there was no such number.
@@ -24,6 +25,7 @@ from jaxtyping import Float
 
 from vcjax.filter.info import FrameInfo
 from vcjax.recorded.filtered import Filtered
+from vcjax.recorded.followed import Followed, followed
 from vcjax.recorded.verdicts import VERDICTS, TrackVerdicts, Verdicts, classes
 from vcjax.recording import Recording
 from vcjax.sources.map_file import LandmarkMap, write_map
@@ -32,8 +34,9 @@ from vcjax.sources.trajectory_file import read_tum, write_kitti, write_tum
 from vcjax.storage import filling, write_file
 
 TableFormat = Literal["csv", "parquet"]
-TABLES, ENDINGS = ("landmarks", "verdicts", "tracks"), ("csv", "parquet")
+TABLES, ENDINGS = ("landmarks", "verdicts", "tracks", "followers"), ("csv", "parquet")
 _MARGINS = ("margin", "detector_margin")
+_VELOCITY_COV = ("cov_vx_vx", "cov_vx_vy", "cov_vx_vz", "cov_vy_vy", "cov_vy_vz", "cov_vz_vz")
 _MAX_JSON_BYTES = 2**24
 _SUMMARY = "summary.json"
 _STALE = ("features/[0-9]*.png", "features.gif", "features.mp4", *(f"{t}.{e}" for t in TABLES for e in ENDINGS))
@@ -111,9 +114,18 @@ def new_run(
         columns = {"track_id": tracks.track_id} | dict(zip(VERDICTS, tracks.counts.T, strict=True))
         margins = {name: getattr(tracks, name) for name in _MARGINS}
         write_table(new / f"tracks.{table}", columns | margins)
+        if (moving := followed(filtered.info)) is not None:
+            write_table(new / f"followers.{table}", _columns(moving))
         yield new
         shown = {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in summary.items()}
         write_file(new / _SUMMARY, f"{json.dumps(shown, indent=1)}\n".encode())
+
+
+def _columns(moving: Followed) -> dict[str, np.ndarray]:
+    columns = {"frame": moving.frame, "track_id": moving.track_id}
+    columns |= dict(zip("xyz", moving.place_m.T, strict=True))
+    columns |= dict(zip(("vx", "vy", "vz"), moving.velocity_m_s.T, strict=True))
+    return columns | dict(zip(_VELOCITY_COV, moving.velocity_cov[:, *np.triu_indices(3)].T, strict=True))
 
 
 def read_run(folder: str | os.PathLike) -> RunFolder:

@@ -77,7 +77,7 @@ def found_distance(known: KnownDistance, landmarks: LastPlaces) -> float:
 
 
 def scaled(filtered: Filtered, factor: float) -> Filtered:
-    """A run with the path of its camera and its landmarks multiplied, as seen from the camera's first place.
+    """A run with the path of its camera, its landmarks and followers multiplied, as seen from the camera's first place.
 
     The camera's place on the robot is known and stays: the robot goes where its camera does. What the motion model
     carries is left as the filter had it.
@@ -92,6 +92,15 @@ def scaled(filtered: Filtered, factor: float) -> Filtered:
     landmarks = filtered.landmarks
     places = place[0] + factor * (landmarks.place_m - place[0])
     info = eqx.tree_at(lambda i: (i.vehicle, i.vehicle_cov), filtered.info, (vehicle, cov))
+    if (followers := info.followers) is not None:
+        scaled_followers = followers._replace(
+            place_m=place[0] + factor * (followers.place_m - place[0]),
+            velocity_m_s=factor * followers.velocity_m_s,
+            cov=factor**2 * followers.cov,
+            rest_place_m=place[0] + factor * (followers.rest_place_m - place[0]),
+            rest_cov=factor**2 * followers.rest_cov,
+        )
+        info = eqx.tree_at(lambda i: i.followers, info, scaled_followers)
     return filtered._replace(
         info=info, landmarks=LastPlaces(landmarks.track_id, places, factor**2 * np.asarray(landmarks.cov))
     )
