@@ -21,6 +21,7 @@ from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.simulation.scenarios import paper
 from vcjax.simulation.simulate import simulate
 from vcjax.study.sweep import Experiment, replace_at
+from vcjax.tuning.losses import Objective
 
 PARAMETERS = {
     "config.gate.th1": (9.0, 1e-4),
@@ -41,10 +42,28 @@ GATES = [
 quick_run = jax.jit(run, compiler_options=QUICK)
 
 
+ALL = Objective(
+    **dict.fromkeys(("track_f1", "track_cross_entropy", "track_ranking", "candidate_f1"), 1.0),
+    **dict.fromkeys(("candidate_cross_entropy", "position", "consistency", "camera_motion"), 1.0),
+)
+"""Every loss there is."""
+
+
+def scene():
+    return paper(dynamic="lateral", dynamic_set=MOVERS, num_frames=30, oscillation_amplitude_m=0.05)
+
+
 @cache
-def recording(num_frames=30):
-    scenario = paper(dynamic="lateral", dynamic_set=MOVERS, num_frames=num_frames, oscillation_amplitude_m=0.05)
-    return jax.jit(simulate, compiler_options=QUICK)(scenario, jax.random.key(3))[0]
+def simulated():
+    return jax.jit(simulate, compiler_options=QUICK)(scene(), jax.random.key(3))
+
+
+def recording():
+    return simulated()[0]
+
+
+def truth():
+    return simulated()[1]
 
 
 def config(gate=STRICT, **options) -> FilterConfig:
@@ -57,6 +76,11 @@ def decisions(info: FrameInfo) -> dict[str, np.ndarray]:
     return {name: np.asarray(getattr(info, name)) for name in names}
 
 
+def losses(info: FrameInfo) -> dict[str, float]:
+    """Of all kinds, of a run of `recording`."""
+    return {name: float(loss) for name, loss in ALL.terms(scene(), info, truth()).items()}
+
+
 @pytest.mark.parametrize("gate", GATES)
 def test_straight_through_is_the_hard_filter_to_the_bit(gate):
     # Compiled as users have it: the quick options round as suits the program around.
@@ -65,11 +89,12 @@ def test_straight_through_is_the_hard_filter_to_the_bit(gate):
     assert hard.is_accepted.any() and (hard.is_measured & ~hard.is_accepted).any()
     assert isinstance(gate, ReprojectionError) or hard.is_recovered.any()
     assert isinstance(gate, VirtualCorrection) == hard.is_dynamic.any()
-    # Soft here and hard there; here of every measured candidate, there of the isolated.
-    judged = ("p_dynamic", "p_detector", "re1_prior", "re2")
+    # Here of every measured candidate, there of the isolated.
+    judged = ("re1_prior", "re2")
     for name in (field.name for field in dataclasses.fields(FrameInfo) if field.name not in judged):
         np.testing.assert_array_equal(getattr(info, name), getattr(hard, name), err_msg=name)
     mapped = np.asarray(state.is_mapped)
+    assert losses(info) == losses(hard)
     np.testing.assert_array_equal(state.vehicle, hard_state.vehicle)
     np.testing.assert_array_equal(state.landmarks[mapped], hard_state.landmarks[mapped])
     np.testing.assert_array_equal(state.P_vv, hard_state.P_vv)
@@ -88,20 +113,20 @@ def test_soft_tends_to_hard_as_the_temperature_falls(gate):
         np.testing.assert_array_equal(getattr(soft, name), expected, err_msg=name)
     np.testing.assert_allclose(soft.vehicle, hard.vehicle, rtol=0, atol=1e-10)
     np.testing.assert_allclose(soft.vehicle_cov, hard.vehicle_cov, rtol=0, atol=1e-12)
-    expected = hard.is_measured & ~(hard.is_accepted | hard.is_recovered)
-    np.testing.assert_allclose(soft.p_dynamic, expected, atol=1e-9)
+    for name in ("p_dynamic", "p_detector"):
+        np.testing.assert_allclose(getattr(soft, name), getattr(hard, name), atol=1e-9)
+    for name, loss in losses(hard).items():
+        assert losses(soft)[name] == pytest.approx(loss, abs=1e-6), name
     _, warm = quick_run(config(gate, smoothing="soft", temperature=1.0), recording())
     assert np.abs(np.asarray(warm.vehicle - hard.vehicle)).max() > 1e-4  # it is not the same filter
 
 
 def loss(filter_config, scenario, parameters, key):
-    """A smooth number of a run: soft verdicts weighted by what they should be, and the error of the position."""
+    """All losses of a run together."""
     experiment = replace_at(Experiment(scenario, filter_config), dict(zip(PARAMETERS, parameters, strict=True)))
     recording, truth = simulate(experiment.scenario, key)
     _, info = run(experiment.config, recording)
-    is_mover = truth.is_moving[info.candidate_id] & (info.candidate_id >= 0)
-    error = info.vehicle[:, :2] - truth.robot[:, :2]
-    return jnp.sum(info.p_dynamic * jnp.where(is_mover, -1.0, 1.0)) + 100 * jnp.sqrt(jnp.mean(error**2)), info
+    return ALL(experiment.scenario, info, truth), info
 
 
 def check_gradient(scenarios, options, seeds, capacities):

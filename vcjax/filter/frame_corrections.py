@@ -37,7 +37,7 @@ class Outcome(NamedTuple):
     dynamic_margin: Float[Array, " K"]
     """By how much a candidate passes what keeps it from being called dynamic, χ²; NaN where not measured."""
     p_dynamic: Float[Array, " K"]
-    """Soft: to what degree a candidate is neither accepted nor recovered."""
+    """To what degree a candidate is called dynamic; soft, neither accepted nor recovered, if the gate calls any so."""
     weight: Float[Array, " K"]
     """To what degree a candidate was used."""
 
@@ -103,12 +103,15 @@ def correct_frame(
     dynamic_margin = jnp.where(is_isolated, jnp.fmin(-margin, verdict.margin), -margin)
     dynamic_margin = jnp.where(is_measured, dynamic_margin, jnp.nan)
     weight = (is_accepted | is_recovered).astype(uv_px.dtype)
-    if config.smoothing == "hard":
-        p_dynamic = is_dynamic.astype(uv_px.dtype)
-    else:
+    p_dynamic = is_dynamic.astype(uv_px.dtype)
+    if config.smoothing != "hard":
         soft_weight = jnp.where(is_measured, _soft_weight(config, margin, verdict), 0.0)
-        p_dynamic = jnp.where(is_measured, 1.0 - soft_weight, 0.0)
-        weight = soft_weight if config.smoothing == "soft" else straight_through(weight, soft_weight)
+        # What a gate leaves out without a verdict, it does not call dynamic.
+        may_be_dynamic = is_measured & ~jnp.isnan(verdict.margin) & gate.condemns
+        soft_p = jnp.where(may_be_dynamic, 1.0 - soft_weight, 0.0)
+        is_soft = config.smoothing == "soft"
+        weight = soft_weight if is_soft else straight_through(weight, soft_weight)
+        p_dynamic = soft_p if is_soft else straight_through(p_dynamic, soft_p)
     return submap, Outcome(
         innovation, verdict, is_accepted, is_recovered, is_dynamic, dynamic_margin, p_dynamic, weight
     )

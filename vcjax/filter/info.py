@@ -46,8 +46,8 @@ class FrameInfo(eqx.Module):
     the isolated the gate's verdict as well, whichever is less. Above 0 where dynamic, or, by a gate without verdicts,
     left out; NaN where not measured."""
     p_dynamic: Float[Array, " K"]
-    """Soft: to what degree a measured candidate is neither accepted nor recovered, in [0, 1]; with hard decisions 1
-    where dynamic, else 0."""
+    """To what degree a measured candidate is called dynamic, in [0, 1]: 1 where it is, else 0; soft, neither accepted
+    nor recovered, by a gate that calls any dynamic."""
     watched_id: Int[Array, " L"]
     """Feature held by each slot when the detector looked; -1 where free, or just called dynamic by the gate."""
     detector: PyTree
@@ -55,7 +55,7 @@ class FrameInfo(eqx.Module):
     detector_margin: Float[Array, " L"]
     """The detector's margin, χ² units: deleted where above 0; NaN where it has nothing to say."""
     p_detector: Float[Array, " L"]
-    """Soft: to what degree the detector calls it dynamic, in [0, 1]; with hard decisions 1 where it does, else 0."""
+    """To what degree the detector calls it dynamic, in [0, 1]: 1 where it does, else 0; soft in a soft filter."""
     inconsistent_id: Int[Array, " L"]
     """Features deleted by the detector; -1 elsewhere."""
     born_id: Int[Array, " births"]

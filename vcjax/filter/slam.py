@@ -124,7 +124,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
         watched_id=jnp.where(is_watched, state.track_id, FREE),
         detector=detector,
         detector_margin=margin,
-        p_detector=decide("hard" if config.smoothing == "hard" else "soft", margin, config.temperature),
+        p_detector=decide(config.smoothing, margin, config.temperature),
         inconsistent_id=jnp.where(is_flagged, state.track_id, FREE),
     )
     is_deleted = is_dynamic | is_flagged

@@ -16,8 +16,9 @@ estimates:
     of the pair     (L(x + ε) - L(x - ε)) ε / 2σ²             sharp where they ripple, as with f
 
 Both come from the same pair of runs of one seed. Each parameter takes their mean weighted by the inverse of their
-variances over the mini-batch, within the scenes. What a soft filter says of a setting is not what the hard filter does
-with it: `choice` looks at that.
+variances over the mini-batch, within the scenes; as these are known from a few pairs only, the weighted mean is
+unbiased no more than nearly. A pair that goes non-finite is left out, and its scene counts less in that step. What a
+soft filter says of a setting is not what the hard filter does with it: `choice` looks at that.
 
 References:
     Ginsburg et al. 2019, "Stochastic gradient methods with layer-wise adaptive moments for training of deep networks".
@@ -43,6 +44,8 @@ from vcjax.tuning.problem import Problem
 
 _MEMORY = (0.5, 0.9)
 """Decay rates of the optimiser's momentum and of its scale: there are a dozen steps and not thousands."""
+_FARTHEST = 12.0
+"""How far a free number may go: its parameter is then within 1e-5 of an end of its interval, and not yet at it."""
 _SUREST = 1e-3
 """Smallest standard error that is believed, as a part of a derivative."""
 
@@ -168,7 +171,7 @@ def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any,
         return free, state
     sure = gradient / np.maximum(error, _SUREST * np.abs(gradient) + np.finfo(float).tiny)
     update, state = optimiser.update(jnp.asarray(sure if np.all(np.isfinite(error)) else gradient), state, free)
-    return free + np.asarray(update), state
+    return np.clip(free + np.asarray(update), -_FARTHEST, _FARTHEST), state
 
 
 def _value_and_gradient(

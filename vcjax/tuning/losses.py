@@ -4,8 +4,12 @@ All are finite with finite derivatives for every run that is, whatever was seen,
 they are taken of (see `gates.surrogates`): a true gradient of a soft run, a declared one of a straight-through run,
 none through the verdicts of a hard run. `p` is the degree p_dynamic to which a candidate of a frame is called dynamic;
 of a track, seen in several frames, it is 1 - (1 - p_detector) Π (1 - p): called so at least once, or by the detector.
-Whose statistic hardly changes from one frame to the next, so that its largest p_detector counts, once. Of a hard run
-the losses of the tracks are those of the features deleted.
+Whose statistic hardly changes from one frame to the next, so that its largest p_detector counts, once. Of a hard or
+straight-through run the losses of the tracks are those of the features deleted.
+
+A degree nearer than 1e-9 to 0 or 1 counts as that near where its logarithm is taken: there `cross_entropy` and
+`ranking_loss` do not change any more, and have no derivative. So they have none at all of a straight-through run, whose
+degrees are 0 and 1, and the worst mistakes of a soft one pull no more than those of about 20 τ.
 """
 
 from typing import NamedTuple
@@ -18,13 +22,15 @@ from jaxtyping import Array, Bool, Float
 
 from vcjax.fields import is_concrete, number, require
 from vcjax.filter.info import FrameInfo
+from vcjax.gates.surrogates import straight_through
 from vcjax.recording import Truth
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study.detection import happened, largest_by_feature
 from vcjax.study.metrics import trajectory_errors
 
 _CLOSEST = 1e-9
-"""How near a degree may come to 0 or 1 before its logarithm is cut off."""
+"""How near a degree may come to 0 or 1 before its logarithm is cut off. Compared with p and 1 - p, and not with p and
+1 - 1e-9, which is 1 in single precision."""
 
 
 class Labelled(NamedTuple):
@@ -49,7 +55,9 @@ def tracks(info: FrameInfo, truth: Truth) -> Labelled:
     is_deleted = happened(info.inconsistent_id, num_features)
     by_detector = jnp.nan_to_num(largest_by_feature(info.watched_id, info.p_detector, num_features))
     place = jnp.where(each.counts, info.candidate_id, num_features).ravel()
-    log_not = jnp.log1p(-jnp.minimum(each.p, 1.0 - _CLOSEST)).ravel()
+    p_not = 1.0 - each.p
+    # The derivative of the product by a factor that is zero is the product of the others: it passes the cut-off.
+    log_not = jnp.log(straight_through(jnp.maximum(p_not, _CLOSEST), p_not)).ravel()
     total = jnp.zeros(num_features, log_not.dtype).at[place].add(log_not, mode="drop")
     counts = is_deleted | happened(jnp.where(each.counts, info.candidate_id, -1), num_features)
     p = jnp.where(counts, 1.0 - (1.0 - by_detector) * jnp.exp(total), 0.0)
@@ -75,10 +83,9 @@ def cross_entropy(labelled: Labelled, mover_weight: float | Float[Array, ""] = 1
         labelled: candidates or tracks.
         mover_weight: w of a mover; the others have 1. Positive.
     """
-    p = jnp.clip(labelled.p, _CLOSEST, 1.0 - _CLOSEST)
     weight = jnp.where(labelled.is_mover, mover_weight, 1.0) * labelled.counts
     total = jnp.sum(weight)
-    log_likelihood = jnp.where(labelled.is_mover, jnp.log(p), jnp.log1p(-p))
+    log_likelihood = jnp.log(jnp.maximum(jnp.where(labelled.is_mover, labelled.p, 1.0 - labelled.p), _CLOSEST))
     return -jnp.sum(weight * log_likelihood) / jnp.where(total > 0, total, 1.0)
 
 
@@ -91,8 +98,8 @@ def ranking_loss(labelled: Labelled, temperature: float | Float[Array, ""] = 1.0
         labelled: tracks, or candidates of one frame: all pairs are formed.
         temperature: τ of the order, in log-odds; positive.
     """
-    p = jnp.clip(labelled.p, _CLOSEST, 1.0 - _CLOSEST)
-    odds = (jnp.log(p) - jnp.log1p(-p)).ravel()
+    p = labelled.p.ravel()
+    odds = jnp.log(jnp.maximum(p, _CLOSEST)) - jnp.log(jnp.maximum(1.0 - p, _CLOSEST))
     is_mover = labelled.is_mover.ravel()
     is_other = labelled.counts.ravel() & ~is_mover
     is_pair = is_mover[:, None] & is_other
@@ -183,8 +190,9 @@ class Objective(eqx.Module):
 
     def __call__(self, scenario: Scenario, info: FrameInfo, truth: Truth) -> Float[Array, ""]:
         """The weighted sum of one run."""
-        terms = self.terms(scenario, info, truth)
-        return sum((getattr(self, name) * value for name, value in terms.items()), jnp.zeros(()))
+        terms = {name: (getattr(self, name), loss) for name, loss in self.terms(scenario, info, truth).items()}
+        wanted = [weight * loss for weight, loss in terms.values() if not is_concrete(weight) or np.any(weight != 0)]
+        return sum(wanted, jnp.zeros(()))
 
 
 WANTED = Objective(track_f1=1.0, position=2.0, camera_motion=0.02)
