@@ -16,6 +16,7 @@ from told import assert_one_line, said
 import vcjax as vc
 from vcjax.cli import main
 from vcjax.sources.map_file import read_map
+from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import load_recording, save_recording
 from vcjax.sources.table_file import write_table
 from vcjax.sources.table_recording import write_labels
@@ -134,9 +135,10 @@ def test_run_writes_all_that_there_is_to_see(results, capsys):
     summary = json.loads((results / "summary.json").read_text())
     assert summary["recording"] == str(recorded.recording_path()) and summary["failures"] == 0
     assert summary["config"]["gate"]["th1"] == 9.0 and summary["frames"] == 30
-    # The truth is exact: 0.9 m on, the path ends within 5 cm of it.
+    # The truth is exact, and the path nearer to it than that of the odometry.
     _, robot = read_tum(results / "robot_tum.txt")
-    assert np.linalg.norm(robot[-1, :3] - rendered().truth.robot[-1, :3]) < 0.05
+    alone = recorded.position_rms(dead_reckoning(recorded.content().recording))
+    assert recorded.position_rms(robot) < 0.75 * alone
     # The camera of the rendered sequence swings on the robot by 10 cm; so does the estimate.
     _, camera = read_tum(results / "camera_tum.txt")
     assert 0.08 < np.ptp(camera[:, 1] - robot[:, 1]) < 0.12
@@ -152,7 +154,7 @@ def test_evaluate_finds_the_movers_and_names_every_alignment(results, tmp_path, 
     assert f"APE, not aligned           {np.sqrt(np.mean(error**2)):.4g} m RMS" in own
     words = movers.splitlines()[0].split()
     auc = next(line for line in movers.splitlines() if line.startswith("AUC, gate")).removeprefix("AUC, gate")
-    assert int(words[1]) >= 3 and float(auc.split()[0]) > 0.7
+    assert int(words[1]) >= 3 and float(auc.split()[0]) > 0.9
     # The same by a trajectory file and by true poses in a file, in both formats.
     truth = np.asarray(rendered().truth.robot)
     write_tum(tmp_path / "true.txt", recorded.content().recording.time_s, truth)
