@@ -227,19 +227,20 @@ def test_missing_images_are_told_and_drawn_without(tmp_path, capsys):
     path = save_recording(tmp_path / "a.npz", recorded.content()._replace(image_paths=("gone.png",) * 30))
     command = ["run", str(path), *recorded.OPTIONS, "--animation", "none", "--out", str(tmp_path / "run")]
     assert main(command) == 0
-    assert f"{tmp_path / 'gone.png'}: no such image; features are drawn on plain axes." in said(capsys)[1]
+    told = said(capsys)[1]
+    assert f"drawn on plain axes: 8 frames, first frame 4: {tmp_path / 'gone.png'}: no such image." in told
 
 
-def test_damaged_image_leaves_the_results_before(results, tmp_path, capsys):
+def test_damaged_image_is_told_and_the_results_are_written(results, tmp_path, capsys):
     (tmp_path / "bad.png").write_bytes(b"no picture")
     paths = (*recorded.content().image_paths[:29], "bad.png")
     path = save_recording(tmp_path / "a.npz", recorded.content()._replace(image_paths=paths))
     out = tmp_path / "run"
-    shutil.copytree(results, out)
-    before = contents(out)
-    assert main(["run", str(path), *recorded.OPTIONS, "--out", str(out)]) == 1
-    assert_one_line(said(capsys)[1].splitlines()[-1], "bad.png: no image that can be read")
-    assert contents(out) == before
+    assert main(["run", str(path), *recorded.OPTIONS, "--out", str(out), "--pictures", "2"]) == 0
+    assert f"drawn on plain axes: frame 29: {tmp_path / 'bad.png'}: no image that can be read" in said(capsys)[1]
+    found, expected = contents(out), contents(results)
+    assert set(found) == set(expected) and found["features/000014.png"] == expected["features/000014.png"]
+    assert all(found[name] == expected[name] for name in expected if name.endswith((".csv", ".txt", ".ply")))
 
 
 def changed(path, out, name, array):

@@ -1,5 +1,7 @@
 """Pictures of features: the colours are where the features are, and tell what was said of them."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import PIL.Image
@@ -78,19 +80,20 @@ def test_plain_axes_without_images():
     assert image.shape == (480 + _LEGEND_PX, 640, 3) and np.median(image) == 255
     told = recorded.content()._replace(image_paths=("nowhere.png",) * 30)
     pictures = drawn(told)
-    assert pictures.missing_image() == recorded.recording_path().parent / "nowhere.png"
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.png: no such image"):
-        pictures.picture(0)
-    pictures.on_plain_axes()
     np.testing.assert_array_equal(rgb(pictures.picture(0)), image)
-    assert drawn().missing_image() is None
+    assert pictures.unread == {0: f"{recorded.recording_path().parent / 'nowhere.png'}: no such image."}
 
 
-def test_image_of_another_size_is_refused(tmp_path):
-    path = tmp_path / "small.png"
-    cv2.imwrite(str(path), np.zeros((10, 20), np.uint8))
-    with pytest.raises(ValueError, match=r"small\.png: 20 × 10 pixels, but the calibration is of 320 × 240"):
-        drawn(recorded.content()._replace(image_paths=(str(path),) * 30)).picture(0)
+def test_images_that_cannot_be_read_are_told_and_the_others_drawn(tmp_path):
+    small, damaged = tmp_path / "small.png", tmp_path / "damaged.png"
+    cv2.imwrite(str(small), np.zeros((10, 20), np.uint8))
+    damaged.write_bytes(Path(recorded.content().image_paths[2]).read_bytes()[:2000])
+    good = recorded.content().image_paths
+    pictures = drawn(recorded.content()._replace(image_paths=(good[0], str(small), str(damaged), *good[3:])))
+    assert [np.median(rgb(pictures.picture(t))) == 255 for t in range(4)] == [False, True, True, False]
+    assert set(pictures.unread) == {1, 2}
+    assert pictures.unread[1].startswith(f"{small}: 20 × 10 pixels, but the calibration is of 320 × 240")
+    assert pictures.unread[2].startswith(f"{damaged}: ")
 
 
 def test_animations_hold_the_frames(tmp_path):

@@ -141,9 +141,6 @@ class Run:
     def _draw_features(self, content: RecordingFile, passed: Verdicts, new: Path, console: Console, show) -> None:
         """Pictures of some frames, and the animation."""
         drawn = FeaturePictures(content, passed, self.recording.absolute().parent)
-        if (missing := drawn.missing_image()) is not None:
-            say(console, f"{missing}: no such image; features are drawn on plain axes.")
-            drawn.on_plain_axes()
         num_frames = content.recording.num_frames
         alone, moving = _spread(num_frames, self.pictures), range(0)
         if self.animation != "none":
@@ -155,6 +152,10 @@ class Run:
         if moving:
             path = new / f"features.{self.animation}"
             drawn.write_animation(moving, path, lambda done, _: show(len(alone) + done, num))
+        if drawn.unread:
+            t, why = min(drawn.unread.items())
+            counted = f"{len(drawn.unread)} frames, first " if len(drawn.unread) > 1 else ""
+            say(console, f"drawn on plain axes: {counted}frame {t}: {why}")
 
 
 def _by_tracks(filtered: Filtered, cut: CutRecording) -> Filtered:

@@ -43,7 +43,10 @@ class Seen(NamedTuple):
 
 
 class FeaturePictures:
-    """Pictures of the frames of a recording with the verdicts of a run."""
+    """Pictures of the frames of a recording with the verdicts of a run.
+
+    A frame whose image cannot be read is drawn on plain axes, and `unread` tells why.
+    """
 
     def __init__(self, content: RecordingFile, passed: Verdicts, folder: Path, width_px: int = 720):
         """A picture of each frame can be asked for.
@@ -64,19 +67,12 @@ class FeaturePictures:
             self.size, self.has_images = (calibration.width, calibration.height), True
             tracks = tracks_of(content.recording, calibration)
         self.scale = float(max(1, -(-width_px // self.size[0])))
+        self.unread: dict[int, str] = {}
+        """What was wrong with the images that could not be read, by frame, of those that were drawn."""
         self._tracks, self._passed = tracks, passed
         is_end = (passed.verdict == DYNAMIC) | (passed.verdict > REJECTED)
         # First frame in which each track was called dynamic or deleted.
         self._ended = dict(zip(passed.track_id[is_end][::-1], passed.frame[is_end][::-1], strict=True))
-
-    def missing_image(self) -> Path | None:
-        """The first image of the recording that is not there, if it has images."""
-        paths = [self._path(t) for t in range(self.content.recording.num_frames)] if self.has_images else []
-        return next((path for path in paths if not path.is_file()), None)
-
-    def on_plain_axes(self) -> None:
-        """Draw no images, though the recording names them."""
-        self.has_images = False
 
     def seen(self, t: int) -> Seen:
         """The features in frame t."""
@@ -95,9 +91,6 @@ class FeaturePictures:
             t: number of the frame.
             scale: pixels of the picture for each of the image; so many that it is wide enough if None.
             num_greys: how many greys the image has.
-
-        Raises:
-            FileNotFoundError, ValueError: if its image is not there, no image, or of another size.
         """
         pillow = extras.load("PIL.Image", "Pictures", "images")
         from PIL import ImageDraw
@@ -106,8 +99,9 @@ class FeaturePictures:
         size = round(self.size[0] * scale), round(self.size[1] * scale)
         canvas = pillow.new("L", (size[0], size[1] + _LEGEND_PX), _WHITE)
         draw = ImageDraw.Draw(canvas)
-        if self.has_images:
-            image = pillow.fromarray(self._grey(t)).resize(size, pillow.Resampling.BILINEAR)
+        grey = self._grey(t)
+        if grey is not None:
+            image = pillow.fromarray(grey).resize(size, pillow.Resampling.BILINEAR)
             image = image.point(lambda grey: round(grey * (num_greys - 1) / _WHITE) * _WHITE // (num_greys - 1))
             canvas.paste(image, (0, _LEGEND_PX))
         else:
@@ -165,14 +159,15 @@ class FeaturePictures:
             (_save_gif if is_gif else _save_video)(pictures(), temporary, step_s)
             return write_file(path, temporary.read_bytes())
 
-    def _path(self, t: int) -> Path:
-        """The image of frame t; relative paths begin at the recording's folder."""
-        assert self.content.image_paths is not None
-        return self.folder / self.content.image_paths[t]
-
-    def _grey(self, t: int) -> UInt8[np.ndarray, "height width"]:
-        """The image of frame t in the greys of the palette."""
-        image = read_image(self._path(t), *self.size)
+    def _grey(self, t: int) -> UInt8[np.ndarray, "height width"] | None:
+        """The image of frame t in the greys of the palette; None if there is none, or it cannot be read."""
+        if not self.has_images or self.content.image_paths is None:
+            return None
+        try:
+            image = read_image(self.folder / self.content.image_paths[t], *self.size)
+        except (OSError, ValueError) as error:
+            self.unread[t] = str(error)
+            return None
         return (image.astype(np.uint16) * (_NUM_GREYS - 1) // 255).astype(np.uint8)
 
 
