@@ -1,5 +1,6 @@
 """Pictures of features: the colours are where the features are, and tell what was said of them."""
 
+import dataclasses
 from pathlib import Path
 
 import cv2
@@ -8,6 +9,7 @@ import PIL.Image
 import pytest
 import recorded
 
+import vcjax as vc
 from vcjax.recorded.verdicts import Verdicts, verdicts
 from vcjax.report.feature_pictures import _LEGEND_PX, STATUSES, FeaturePictures
 from vcjax.report.path_view import path_figure
@@ -82,6 +84,16 @@ def test_plain_axes_without_images():
     pictures = drawn(told)
     np.testing.assert_array_equal(rgb(pictures.picture(0)), image)
     assert pictures.unread == {0: f"{recorded.recording_path().parent / 'nowhere.png'}: no such image."}
+
+
+def test_a_camera_of_any_shape_is_drawn_small():
+    """No file asks for a picture that memory does not hold."""
+    content = recorded.content()
+    for size in ((1.0, 32768.0), (32768.0, 1.0)):
+        recording = dataclasses.replace(content.recording, camera=vc.Camera(image_size_px=size))
+        pictures = drawn(content._replace(recording=recording, image_paths=None, calibration=None))
+        assert max(pictures.picture(0).size) <= 8192 + _LEGEND_PX
+        assert max(pictures.picture(0, 640 / 32768).size) <= 640 + _LEGEND_PX
 
 
 def test_images_that_cannot_be_read_are_told_and_the_others_drawn(tmp_path):

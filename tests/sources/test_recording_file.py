@@ -143,6 +143,8 @@ BAD = {
     "NaN": ({"odometry.npy": npy(np.full((5, 6), np.nan))}, r"odometry\[0, 0\] = nan\): must be finite"),
     "negative id": ({"track_id.npy": npy(np.full((5, 4), -1))}, r"track_id\[0, 1\] = -1\): .*ids start at 0"),
     "impossible camera": ({"camera_intrinsics_px.npy": npy([0.0, 0, -1, 1])}, r"Camera\(intrinsics_px.*positive"),
+    "camera of no size": ({"camera_image_size_px.npy": npy([1e9, 240.0])}, r"image_size_px.*1 to 32768 px"),
+    "camera without end": ({"camera_image_size_px.npy": npy([np.inf, 240.0])}, "image_size_px"),
     "truth of other frames": ({"truth_robot.npy": npy(np.zeros((4, 7)))}, r"Truth\(robot\) has shape \(4, 7\)"),
     "unknown label": ({"label.npy": npy([0, 1, 5])}, r"label\[2\] = 5; give one of -1 UNKNOWN, 0 STATIC"),
     "track labelled twice": ({"label_track_id.npy": npy([0, 3, 3])}, "names a track twice"),

@@ -29,6 +29,7 @@ _NUM_GREYS = 250
 _COLOURS = [*(CLASS_COLOURS[name] for name in ("accepted", "recovered", "dynamic")), (86, 180, 233), (240, 228, 66)]
 _BLACK, _WHITE = 0, _NUM_GREYS - 1
 _LEGEND_PX = 26
+_MOST_PX = 8192
 _GIF_WIDTH_PX, _GIF_GREYS = 640, 24
 
 
@@ -55,7 +56,8 @@ class FeaturePictures:
             content: the recording.
             passed: verdicts of a run over it.
             folder: where relative paths of its images begin.
-            width_px: least width of a picture; smaller images are enlarged by a whole number.
+            width_px: least width of a picture; smaller images are enlarged by a whole number, those with a side of
+                more than 8192 px shrunk.
         """
         self.content, self.folder = content, folder
         calibration = content.calibration
@@ -66,7 +68,7 @@ class FeaturePictures:
         else:
             self.size, self.has_images = (calibration.width, calibration.height), True
             tracks = tracks_of(content.recording, calibration)
-        self.scale = float(max(1, -(-width_px // self.size[0])))
+        self.scale = min(float(max(1, -(-width_px // self.size[0]))), _MOST_PX / max(self.size))
         self.unread: dict[int, str] = {}
         """What was wrong with the images that could not be read, by frame, of those that were drawn."""
         self._tracks, self._passed = tracks, passed
@@ -96,7 +98,7 @@ class FeaturePictures:
         from PIL import ImageDraw
 
         scale = self.scale if scale is None else scale
-        size = round(self.size[0] * scale), round(self.size[1] * scale)
+        size = max(1, round(self.size[0] * scale)), max(1, round(self.size[1] * scale))
         canvas = pillow.new("L", (size[0], size[1] + _LEGEND_PX), _WHITE)
         draw = ImageDraw.Draw(canvas)
         grey = self._grey(t)
@@ -229,7 +231,7 @@ def _plain_axes(draw: Any, size: tuple[int, int], scale: float) -> None:
 
     font, light, grey = ImageFont.load_default(size=10), int(0.93 * _WHITE), int(0.5 * _WHITE)
     step = 10 ** np.floor(np.log10(max(size) / 2)) if max(size) >= 20 else 1
-    width, height = size[0] * scale, size[1] * scale
+    width, height = (max(1.0, side * scale) for side in size)
     draw.rectangle((0, _LEGEND_PX, width - 1, _LEGEND_PX + height - 1), outline=grey)
     for u in np.arange(step, size[0], step):
         draw.line((u * scale, _LEGEND_PX + 1, u * scale, _LEGEND_PX + height - 2), fill=light)

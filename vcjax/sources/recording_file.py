@@ -32,7 +32,7 @@ from vcjax.fields import require_kind
 from vcjax.models.camera import Camera
 from vcjax.recording import Recording, Truth, validate
 from vcjax.sources.arrays_file import MAX_BYTES, read_arrays, write_arrays
-from vcjax.sources.calibration import Calibration
+from vcjax.sources.calibration import MAX_SIDE_PX, Calibration
 
 SCHEMA = 1
 """Version of the layout, raised when an older reader would misread it."""
@@ -174,7 +174,11 @@ def _check(path: str, content: RecordingFile) -> None:
         validate(recording)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    num_frames = recording.num_frames
+    num_frames, size = recording.num_frames, np.asarray(recording.camera.image_size_px)
+    if not np.all((size >= 1) & (size <= MAX_SIDE_PX)):
+        raise ValueError(
+            f"{path}: Camera(image_size_px={size.tolist()}): give a width and height of 1 to {MAX_SIDE_PX} px."
+        )
     if truth is not None:
         num_features = np.shape(truth.is_moving)[0] if np.ndim(truth.is_moving) == 1 else "F"
         shapes = {
