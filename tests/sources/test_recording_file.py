@@ -37,13 +37,34 @@ def assert_same(found, expected):
             assert (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes()), field.name
 
 
+def poses(rng, num: int) -> np.ndarray:
+    found = rng.normal(size=(num, 7))
+    found[:, 3:] /= np.linalg.norm(found[:, 3:], axis=1, keepdims=True)
+    return found
+
+
+def truth(**changes) -> dict[str, bytes]:
+    """The entries of the truth with others in place of some numbers, and two features."""
+    known = full().truth
+    arrays = {
+        "robot": known.robot,
+        "sensor": known.sensor,
+        "landmarks_m": np.zeros((5, 2, 3)),
+        "is_moving": [False] * 2,
+    }
+    for name, (place, value) in changes.items():
+        arrays[name] = arrays[name].copy()
+        arrays[name][place] = value
+    return {f"truth_{name}.npy": npy(array) for name, array in arrays.items()}
+
+
 def full() -> RecordingFile:
     recording = good_recording()
     num_frames = recording.num_frames
     rng = np.random.default_rng(1)
     truth = Truth(
-        robot=np.where(np.arange(num_frames)[:, None] < 3, rng.normal(size=(num_frames, 7)), np.nan),
-        sensor=rng.normal(size=(num_frames, 7)),
+        robot=np.where(np.arange(num_frames)[:, None] < 3, poses(rng, num_frames), np.nan),
+        sensor=poses(rng, num_frames),
         landmarks_m=np.zeros((num_frames, 0, 3)),
         is_moving=np.zeros(0, bool),
     )
@@ -157,6 +178,16 @@ BAD = {
     "negative length": ({"uv_px.npy": header((-1, 2))}, r"no readable header .*shape \(-1, 2\)"),
     "less than stated": ({"uv_px.npy": header((5, 4, 2)) + b"\0" * 8}, "uv_px has 8 bytes, but shape .* has 320"),
     "far more than there is": ({"uv_px.npy": header((2**30, 2**9, 2))}, "uv_px has 0 bytes, but shape"),
+}
+
+
+BAD |= {
+    "true quaternion of zeros": (truth(robot=((1, slice(3, 7)), 0.0)), r"Truth\(robot\[1\]\).* length 0\b"),
+    "long true quaternion": (truth(sensor=((4, slice(3, 7)), 2.5)), r"Truth\(sensor\[4\]\).* length 5\b"),
+    "true place without end": (truth(robot=((2, 1), np.inf)), r"Truth\(robot\[2, 1\] = inf\).*NaN"),
+    "feature nowhere": (truth(landmarks_m=((3, 1, 2), np.nan)), r"Truth\(landmarks_m\[3, 1, 2\] = nan\)"),
+    "label of a negative id": ({"label_track_id.npy": npy([0, -5, 7])}, r"label_track_id\[1\] = -5"),
+    "label of a huge id": ({"label_track_id.npy": npy([0, 3, 2**50])}, r"label_track_id\[2\] = 1125899906842624"),
 }
 
 
