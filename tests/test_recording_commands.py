@@ -132,8 +132,12 @@ def test_run_writes_all_that_there_is_to_see(results, capsys):
         "verdicts.csv", "tracks.csv", "summary.json", "path.png", "features.gif", "features/000014.png",
         "features/000029.png",
     }  # fmt: skip
-    summary = json.loads((results / "summary.json").read_text())
-    assert summary["recording"] == str(recorded.recording_path()) and summary["failures"] == 0
+    summary = json.loads((results / "summary.json").read_text(), parse_constant=pytest.fail)  # no Infinity, no NaN
+    assert (
+        summary["config"]["blacklist_frames"] is None
+        and summary["recording"] == str(recorded.recording_path())
+        and summary["failures"] == 0
+    )
     assert summary["config"]["gate"]["th1"] == 9.0 and summary["frames"] == 30
     # The truth is exact, and the path nearer to it than that of the odometry.
     _, robot = read_tum(results / "robot_tum.txt")

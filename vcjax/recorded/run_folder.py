@@ -31,7 +31,7 @@ from vcjax.recording import Recording
 from vcjax.sources.map_file import LandmarkMap, write_map
 from vcjax.sources.table_file import Kind, read_table, write_table
 from vcjax.sources.trajectory_file import read_tum, write_kitti, write_tum
-from vcjax.storage import filling, write_file
+from vcjax.storage import filling, write_json
 
 TableFormat = Literal["csv", "parquet"]
 TABLES, ENDINGS = ("landmarks", "verdicts", "tracks", "followers"), ("csv", "parquet")
@@ -117,8 +117,7 @@ def new_run(
         if (moving := followed(filtered.info)) is not None:
             write_table(new / f"followers.{table}", _columns(moving))
         yield new
-        shown = {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in summary.items()}
-        write_file(new / _SUMMARY, f"{json.dumps(shown, indent=1)}\n".encode())
+        write_json(new / _SUMMARY, summary)
 
 
 def _columns(moving: Followed) -> dict[str, np.ndarray]:

@@ -32,7 +32,7 @@ from vcjax.filter.slam import start
 from vcjax.filter.state import FilterState
 from vcjax.recording import PER_FRAME, Recording
 from vcjax.sources.arrays_file import read_arrays, write_arrays
-from vcjax.storage import write_file
+from vcjax.storage import with_nulls, write_json
 from vcjax.study.results import describe, refuse_other_settings
 
 EVERY_S = 10.0
@@ -110,7 +110,7 @@ class Unfinished:
             OSError: if the place cannot be written; what was there before stays.
         """
         if first_frame == 0:
-            write_file(self.folder / _SETTINGS, f"{json.dumps(self._settings, indent=1)}\n".encode())
+            write_json(self.folder / _SETTINGS, self._settings)
         next_frame = first_frame + len(info.is_finite)
         write_arrays(self._frames(first_frame), _named(info))
         told = {"next_frame": np.array(next_frame), "run_s": np.array(run_s)}
@@ -143,7 +143,8 @@ def _settings(config: FilterConfig, recording: Recording, known: KnownLandmarks 
         digest.update(array.tobytes())
     dtype = str(jax.dtypes.canonicalize_dtype(np.float64))
     settings = {"config": describe(config), "recording and known landmarks": digest.hexdigest(), "dtype": dtype}
-    return json.loads(json.dumps(settings))  # as it is read
+    # As it is read: null stands for infinity, which no other value of the same field can be taken for.
+    return json.loads(json.dumps(with_nulls(settings)))
 
 
 def _named(tree: PyTree) -> dict[str, np.ndarray]:
