@@ -399,3 +399,21 @@ def test_evaluate_without_anything_to_compare_with(results, tmp_path, capsys):
     (copy / "summary.json").write_text(json.dumps(summary | {"recording": str(tmp_path / "gone.npz")}))
     assert main(["evaluate", str(copy)]) == 1
     assert_one_line(said(capsys)[1], "gone.npz, which was run: no such file; give --truth")
+
+
+def test_evaluate_knows_a_recording_that_was_replaced(results, tmp_path, capsys):
+    """By the recording itself: truth and labels may be better known today."""
+    copy, path = tmp_path / "run", tmp_path / "a.npz"
+    shutil.copytree(results, copy)
+    summary = json.loads((copy / "summary.json").read_text())
+    (copy / "summary.json").write_text(json.dumps(summary | {"recording": str(path)}))
+    content = recorded.content()
+    save_recording(path, content._replace(labels=None))
+    assert main(["evaluate", str(copy)]) == 0
+    said(capsys)
+    odometry = np.array(content.recording.odometry)
+    odometry[5, 0] += 1e-9
+    save_recording(path, content._replace(recording=dataclasses.replace(content.recording, odometry=odometry)))
+    assert main(["evaluate", str(copy)]) == 1
+    assert_one_line(said(capsys)[1], "a.npz is not the recording that was run any more", "or give --truth")
+    assert main(["evaluate", str(copy), "--truth", str(path)]) == 0

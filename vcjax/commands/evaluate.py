@@ -11,6 +11,7 @@ from vcjax.commands.console import say
 from vcjax.recorded.run_folder import RunFolder, read_run
 from vcjax.recorded.track_detection import labels_of, track_detection, track_detection_text
 from vcjax.recorded.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
+from vcjax.recorded.unfinished import digest
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, load_recording
 from vcjax.sources.trajectory_file import read_trajectory
@@ -37,6 +38,8 @@ class Evaluate:
         path = self._truth_path(run)
         estimate = Trajectory(run.robot, run.time_s) if run is not None else _trajectory(self.estimate)
         content = load_recording(path) if path.suffix.lower() == ".npz" else None
+        if run is not None and content is not None and self.truth is None:
+            _refuse_replaced(path, content, run)
         truth = _trajectory(path) if content is None else _true_path(content)
         parts = []
         if truth is not None:
@@ -64,6 +67,12 @@ class Evaluate:
         if not Path(recording).is_file():
             raise FileNotFoundError(f"{recording}, which was run: no such file; give --truth.")
         return Path(recording)
+
+
+def _refuse_replaced(path: Path, content: RecordingFile, run: RunFolder) -> None:
+    """Refuse a recording other than the one that was run, though its file has the same name."""
+    if run.summary.get("recording_sha256", known := digest(content.recording)) != known:
+        raise ValueError(f"{path} is not the recording that was run any more; run it again, or give --truth.")
 
 
 def _trajectory(path: Path) -> Trajectory:

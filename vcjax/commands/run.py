@@ -19,7 +19,7 @@ from vcjax.recorded import run_folder
 from vcjax.recorded.filtered import Filtered, filter_recording
 from vcjax.recorded.run_summary import run_summary, run_summary_text
 from vcjax.recorded.scale import KnownDistance, check_known_distance, found_distance, scale_source, scaled
-from vcjax.recorded.unfinished import Unfinished
+from vcjax.recorded.unfinished import Unfinished, digest
 from vcjax.recorded.verdicts import Verdicts, track_verdicts, verdicts
 from vcjax.report.feature_pictures import FeaturePictures
 from vcjax.report.path_view import path_figure
@@ -114,7 +114,11 @@ class Run:
         cuts = {"tracks_cut": None if cut is None else cut.num_cuts}
         summary: dict[str, Any] = run_summary(self.config, content.recording, filtered, tracks) | scale | cuts
         print(run_summary_text(summary), flush=True)
-        provenance = {"recording": str(self.recording.absolute()), "config": describe(self.config)}
+        provenance = {
+            "recording": str(self.recording.absolute()),
+            "recording_sha256": digest(content.recording),
+            "config": describe(self.config),
+        }
         with (
             run_folder.new_run(
                 out, content.recording, filtered, passed, tracks, summary | provenance, self.table

@@ -52,7 +52,7 @@ class RunFolder(NamedTuple):
     tracks: TrackVerdicts
     """What became of each track."""
     summary: dict[str, Any]
-    """Numbers of the run; "recording" is the file that it read."""
+    """Numbers of the run; "recording" is the file that it read, "recording_sha256" the `digest` of what it held."""
 
 
 def landmark_map(filtered: Filtered, tracks: TrackVerdicts) -> LandmarkMap:

@@ -134,15 +134,24 @@ def first_frames(recording: Recording, num: int) -> Recording:
     return eqx.tree_at(of_frames, recording, [leaf[:num] for leaf in of_frames(recording)])
 
 
+def digest(tree: PyTree) -> str:
+    """SHA-256 of all arrays of a recording, or of another tree, in hexadecimal: the same for the same numbers only."""
+    found = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        array = np.ascontiguousarray(leaf)
+        found.update(f"{array.dtype}{array.shape}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
+
+
 def _settings(config: FilterConfig, recording: Recording, known: KnownLandmarks | None) -> dict[str, Any]:
     """All that the numbers of a run depend on."""
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves((recording, known)):
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(array.tobytes())
     dtype = str(jax.dtypes.canonicalize_dtype(np.float64))
-    settings = {"config": describe(config), "recording and known landmarks": digest.hexdigest(), "dtype": dtype}
+    settings = {
+        "config": describe(config),
+        "recording and known landmarks": digest((recording, known)),
+        "dtype": dtype,
+    }
     # As it is read: null stands for infinity, which no other value of the same field can be taken for.
     return json.loads(json.dumps(with_nulls(settings)))
 
