@@ -1,6 +1,7 @@
 """Recordings filtered in stretches: the numbers of one scan, and the map that a scan forgets."""
 
 import dataclasses
+import tracemalloc
 
 import jax
 import numpy as np
@@ -13,11 +14,12 @@ from tiny_runs import compilations
 
 import vcjax as vc
 from vcjax.filter.state import landmark_cov
+from vcjax.filter.stretches import STRETCH
 from vcjax.recorded.filtered import filter_recording
 from vcjax.recorded.run_folder import robot_poses
 from vcjax.recorded.track_detection import track_detection
 from vcjax.recorded.verdicts import track_verdicts, verdicts
-from vcjax.recording import PER_FRAME
+from vcjax.recording import PER_FRAME, last_sightings
 from vcjax.sources.odometry import dead_reckoning
 
 run_once = jax.jit(vc.run, compiler_options=QUICK)
@@ -26,11 +28,15 @@ run_once = jax.jit(vc.run, compiler_options=QUICK)
 def test_infos_and_map_are_those_of_one_scan():
     recording, found = recorded.content().recording, recorded.run()
     state, info = run_once(recorded.config(), recording)
-    assert found.info.departed is None
-    for field in dataclasses.fields(info):
-        one, other = (jax.tree.leaves(getattr(x, field.name)) for x in (found.info, info))
-        for a, b in zip(one, other, strict=field.name != "departed"):
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-8, err_msg=field.name)
+    left_out = {f.name for f in dataclasses.fields(info) if getattr(found.info, f.name) is None}
+    assert left_out == {
+        "carried", "carried_std", "pixel", "innovation", "innovation_cov", "re1_prior", "p_dynamic", "detector",
+        "p_detector", "departed", "followers", "handed_back_id",
+    }  # fmt: skip
+    for name in {f.name for f in dataclasses.fields(info)} - left_out:
+        one, other = (jax.tree.leaves(getattr(x, name)) for x in (found.info, info))
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-8, err_msg=name)
     # Those that the map still holds, worked out anew: p₀ + m/ρ, and its covariance by differences.
     held = np.flatnonzero(np.asarray(state.track_id) >= 0)
     landmarks, cov = np.asarray(state.landmarks)[held], np.asarray(landmark_cov(state))[held]
@@ -45,6 +51,29 @@ def test_infos_and_map_are_those_of_one_scan():
         J = np.stack([(point(x + step) - point(x - step)) / 2e-6 for step in 1e-6 * np.eye(7)], axis=1)
         np.testing.assert_allclose(places[track], point(x), atol=1e-8 * np.abs(point(x)).max())
         np.testing.assert_allclose(covs[track], J @ P @ J.T, atol=1e-4 * np.abs(covs[track]).max())
+
+
+def test_memory_grows_by_what_is_kept_of_each_frame_alone():
+    """Nothing is held twice, and nothing that no result is made of."""
+    recorded.run()
+    recording, peaks, kept = recorded.content().recording, [], 0
+
+    def begin(done, _):
+        if done <= STRETCH:
+            tracemalloc.reset_peak()  # what it took to check the recording is free again
+
+    for laps in (20, 60):
+        many = {name: np.concatenate([np.asarray(getattr(recording, name))] * laps) for name in PER_FRAME}
+        many["time_s"] = 0.1 * np.arange(30 * laps)
+        many["is_last"] = last_sightings(many["track_id"], many["is_valid"])
+        long = dataclasses.replace(recording, **many)
+        tracemalloc.start()
+        found = filter_recording(recorded.config(), long, begin)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        kept = sum(leaf.nbytes for leaf in jax.tree.leaves(found.info)) / (30 * laps)
+    per_frame = (peaks[1] - peaks[0]) / (30 * 40)
+    assert kept < 5000 and per_frame < 1.2 * kept
 
 
 def test_landmarks_that_left_the_map_stay_known():

@@ -16,7 +16,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,8 +48,8 @@ class Begun(NamedTuple):
     run_s: float
     """How long it took, s."""
     state: FilterState
-    infos: list[FrameInfo]
-    """Infos of all frames before, in pieces."""
+    infos: Iterator[FrameInfo]
+    """Infos of all frames before, in pieces, read as they are asked for; ValueError if one lacks or is damaged."""
 
 
 class Unfinished:
@@ -92,16 +92,20 @@ class Unfinished:
         if not isinstance(found, dict):
             raise ValueError(f"{self.folder / _SETTINGS}: not what a run left; {remedy}")
         refuse_other_settings(self.folder, found, self._settings)
-        shapes, infos, frame = self._shapes, [], 0
-        state, told = _read(path, shapes[0], {"next_frame": "iu", "run_s": "f"}, False)
-        next_frame, run_s = int(told["next_frame"]), float(told["run_s"])
+        state, told = _read(path, self._shapes[0], {"next_frame": "iu", "run_s": "f"}, False)
+        next_frame = int(told["next_frame"])
+        return Begun(next_frame, float(told["run_s"]), state, self._infos(next_frame, remedy))
+
+    def _infos(self, next_frame: int, remedy: str) -> Iterator[FrameInfo]:
+        frame = 0
         while frame < next_frame:
-            info, _ = _read(self._frames(frame), shapes[1], {}, True)
-            infos.append(info)
+            info, _ = _read(self._frames(frame), self._shapes[1], {}, True)
             frame += max(1, len(info.is_finite))
+            if frame > next_frame:
+                break
+            yield info
         if frame != next_frame:
             raise ValueError(f"{self.folder}: holds frames up to {frame - 1}, not {next_frame - 1}; {remedy}")
-        return Begun(next_frame, run_s, state, infos)
 
     def write(self, first_frame: int, info: FrameInfo, state: FilterState, run_s: float) -> None:
         """Keep some frames, and the state after them.
