@@ -28,6 +28,7 @@ from vcjax.recorded.filtered import Filtered
 from vcjax.recorded.followed import Followed, followed
 from vcjax.recorded.verdicts import VERDICTS, TrackVerdicts, Verdicts, classes
 from vcjax.recording import Recording
+from vcjax.sources.image_sequence import camera_of_robot
 from vcjax.sources.map_file import LandmarkMap, write_map
 from vcjax.sources.table_file import Kind, read_table, write_table
 from vcjax.sources.trajectory_file import read_tum, write_kitti, write_tum
@@ -67,13 +68,7 @@ def robot_poses(info: FrameInfo) -> Float[np.ndarray, "T 7"]:
 
 def camera_poses(info: FrameInfo) -> Float[np.ndarray, "T 7"]:
     """Estimated poses T_w_c = T_w_r T_r_s of the camera in each frame."""
-    from scipy.spatial.transform import Rotation
-
-    robot, sensor = np.split(np.array(info.vehicle, np.float64), 2, axis=1)
-    turn = Rotation.from_quat(robot[:, 3:], scalar_first=True)
-    place = robot[:, :3] + turn.apply(sensor[:, :3])
-    turn = turn * Rotation.from_quat(sensor[:, 3:], scalar_first=True)
-    return np.column_stack([place, turn.as_quat(scalar_first=True)])
+    return camera_of_robot(*np.split(np.asarray(info.vehicle), 2, axis=1))
 
 
 @contextlib.contextmanager

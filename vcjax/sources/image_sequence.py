@@ -219,6 +219,20 @@ def interpolated(
     return found
 
 
+def camera_of_robot(T_w_r: Float[np.ndarray, "T 7"], T_r_s: Float[np.ndarray, "T 7"]) -> Float[np.ndarray, "T 7"]:
+    """Poses of the camera from those of its robot, T_w_c = T_w_r T_r_s; NaN stays NaN."""
+    from scipy.spatial.transform import Rotation
+
+    T_w_r, T_r_s = np.array(T_w_r, np.float64), np.array(T_r_s, np.float64)
+    is_known, found = np.isfinite(T_w_r).all(axis=1), np.full(T_w_r.shape, np.nan)
+    if np.any(is_known):
+        robot = Rotation.from_quat(T_w_r[is_known, 3:], scalar_first=True)
+        turn = robot * Rotation.from_quat(T_r_s[is_known, 3:], scalar_first=True)
+        found[is_known, :3] = T_w_r[is_known, :3] + robot.apply(T_r_s[is_known, :3])
+        found[is_known, 3:] = turn.as_quat(scalar_first=True)
+    return found
+
+
 def robot_of_camera(T_w_c: Float[np.ndarray, "T 7"], T_r_s: Float[np.ndarray, "T 7"]) -> Float[np.ndarray, "T 7"]:
     """Poses of the robot from those of its camera, T_w_r = T_w_c T_r_s⁻¹; NaN stays NaN."""
     from scipy.spatial.transform import Rotation
