@@ -153,7 +153,9 @@ def test_evaluate_finds_the_movers_and_names_every_alignment(results, tmp_path, 
     printed, _ = said(capsys)
     assert (tmp_path / "a.txt").read_text() == printed
     own, alone, movers = printed.split("\n\n")
-    assert own.startswith("compared                   30 poses") and alone.startswith("odometry alone")
+    assert own.startswith(
+        "poses of                   the robot\ncompared                   30 poses"
+    ) and alone.startswith("odometry alone")
     error = np.linalg.norm(read_tum(results / "robot_tum.txt")[1][:, :3] - rendered().truth.robot[:, :3], axis=1)
     assert f"APE, not aligned           {np.sqrt(np.mean(error**2)):.4g} m RMS" in own
     words = movers.splitlines()[0].split()
@@ -165,7 +167,7 @@ def test_evaluate_finds_the_movers_and_names_every_alignment(results, tmp_path, 
     write_kitti(tmp_path / "true_kitti.txt", truth)
     for estimate, true in (("robot_tum.txt", "true.txt"), ("robot_kitti.txt", "true_kitti.txt"), (".", "true.txt")):
         assert main(["evaluate", str(results / estimate), "--truth", str(tmp_path / true)]) == 0
-        assert said(capsys)[0].splitlines()[:5] == own.splitlines()[:5]
+        assert said(capsys)[0].splitlines()[:6] == own.splitlines()[:6]
 
 
 def test_run_and_simulate_meet(tmp_path, capsys):
@@ -399,6 +401,25 @@ def test_evaluate_without_anything_to_compare_with(results, tmp_path, capsys):
     (copy / "summary.json").write_text(json.dumps(summary | {"recording": str(tmp_path / "gone.npz")}))
     assert main(["evaluate", str(copy)]) == 1
     assert_one_line(said(capsys)[1], "gone.npz, which was run: no such file; give --truth")
+
+
+def test_evaluate_the_path_of_the_camera(results, folder, tmp_path, capsys):
+    """The camera's true poses are another path; the run, its file and the recording's truth say the same of it."""
+    evaluate = ["evaluate", "--truth-of", "camera"]
+    assert main([*evaluate, str(results)]) == 0
+    whole, alone, _ = said(capsys)[0].split("\n\n")
+    assert alone.startswith("odometry alone")
+    for estimate, truth in (
+        (results, folder / "groundtruth.txt"),
+        (results / "camera_tum.txt", folder / "groundtruth.txt"),
+        (results / "camera_tum.txt", recorded.recording_path()),
+    ):
+        assert main([*evaluate, str(estimate), "--truth", str(truth)]) == 0
+        assert said(capsys)[0].splitlines()[:6] == whole.splitlines()[:6]
+    error = read_tum(results / "camera_tum.txt")[1][:, :3] - read_tum(folder / "groundtruth.txt")[1][:, :3]
+    assert f"APE, not aligned           {np.sqrt(np.mean(np.sum(error**2, axis=1))):.4g} m RMS" in whole
+    assert main(["evaluate", str(results / "camera_tum.txt"), "--truth", str(recorded.recording_path())]) == 0
+    assert said(capsys)[0].startswith("poses of                   the robot\n")
 
 
 def test_evaluate_knows_a_recording_that_was_replaced(results, tmp_path, capsys):

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vcjax import extras
-from vcjax.recording import Truth
+from vcjax.recording import AnyArray, Truth
 from vcjax.sources.calibration import Calibration
 from vcjax.sources.front_end import FrontEnd, track_images
 from vcjax.sources.odometry import Odometry, unknown_motion
@@ -219,7 +219,7 @@ def interpolated(
     return found
 
 
-def camera_of_robot(T_w_r: Float[np.ndarray, "T 7"], T_r_s: Float[np.ndarray, "T 7"]) -> Float[np.ndarray, "T 7"]:
+def camera_of_robot(T_w_r: Float[AnyArray, "T 7"], T_r_s: Float[AnyArray, "T 7"]) -> Float[np.ndarray, "T 7"]:
     """Poses of the camera from those of its robot, T_w_c = T_w_r T_r_s; NaN stays NaN."""
     from scipy.spatial.transform import Rotation
 
