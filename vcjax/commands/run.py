@@ -29,6 +29,7 @@ from vcjax.sources.map_file import LandmarkMap
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, load_recording
 from vcjax.sources.repeats import CutRecording, cut_recording
+from vcjax.sources.warnings import NO_ODOMETRY
 from vcjax.storage import check_writable
 from vcjax.study.results import describe
 
@@ -96,6 +97,8 @@ class Run:
         source = scale_source(self.config.motion, content.recording, known)
         if distance is not None:
             check_known_distance(distance, content.recording, source)
+        if self.config.motion.gives_scale and not np.any(np.asarray(content.recording.odometry)):
+            say(console, NO_ODOMETRY)
         cut = cut_recording(content.recording) if self.cut_repeats else None
         recording = content.recording if cut is None else cut.recording
         unfinished = Unfinished(out / "unfinished", self.config, recording, known)

@@ -12,6 +12,7 @@ from vcjax.sources.tracks import tracks_of
 
 JUMP = 1.5
 """A time step this many times the median, or more, is a jump: at least one frame in between was dropped."""
+NO_ODOMETRY = "no odometry: run with --motion constant_velocity; the scale is free unless a length is known"
 _MOST_NAMED = 5
 
 
@@ -76,7 +77,7 @@ def warnings(recording: Recording) -> list[str]:
     if num := without_ray(recording):
         found.append(f"{num} sightings are left out, as the lens of the calibration has no place for their pixels")
     if not np.any(np.asarray(recording.odometry)):
-        found.append("no odometry: run with --motion constant_velocity; the scale is free unless a length is known")
+        found.append(NO_ODOMETRY)
     return found
 
 
