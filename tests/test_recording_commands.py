@@ -206,7 +206,8 @@ def test_scale_by_a_distance_by_points_or_free(bare, tmp_path, capsys):
     command = ["run", str(bare), *recorded.OPTIONS, "--motion", "constant_velocity", "--inverse-depth-mean", "0.3"]
     command += ["--acceleration", "0.5", "--cut-repeats", "--out", str(out), "--pictures", "0", "--animation", "none"]
     assert main(command) == 0
-    assert "scale            free: lengths are those of the priors" in said(capsys)[0]
+    printed, told = said(capsys)
+    assert "scale            free: lengths are those of the priors" in printed and "no odometry" not in told
     summary = json.loads((out / "summary.json").read_text())
     assert summary["config"]["motion"]["acceleration"] == 0.5 and summary["tracks_cut"] == 0
     free = read_map(out / "landmarks.csv")
@@ -215,6 +216,9 @@ def test_scale_by_a_distance_by_points_or_free(bare, tmp_path, capsys):
     assert main([*command, "--known-distance", *pair, "1.3"]) == 0
     printed = said(capsys)[0]
     assert f"scale            known from 1.3 m between tracks {pair[0]} and {pair[1]}; lengths are mult" in printed
+    without = ["run", str(bare), *recorded.OPTIONS, "--out", str(tmp_path / "b"), "--pictures", "0"]
+    assert main([*without, "--animation", "none"]) == 0
+    assert "no odometry: run with --motion constant_velocity; the scale is free" in said(capsys)[1]
     scaled = read_map(out / "landmarks.csv")
     assert np.linalg.norm(scaled.place_m[i] - scaled.place_m[j]) == pytest.approx(1.3)
     x, y, z = recorded.run().landmarks.place_m[0]
@@ -358,6 +362,7 @@ def test_million_rows_with_one_bad_cell(tmp_path, ending, place):
         ("run {recording} --birth-order random", ["birth_order='random'"]),
         ("run file", ["file: not a sound .npz file"]),
         ("inspect nowhere.npz", ["nowhere.npz: no such file"]),
+        ("inspect .", [".: no such file"]),
         ("inspect {recording} --picture folder", ["folder is a directory"]),
         ("track nowhere", ["nowhere: no such folder"]),
         ("track folder", ["folder: no image in it"]),
