@@ -173,11 +173,15 @@ print(trajectory_error_text(error))
 print("\nodometry alone\n" + trajectory_error_text(alone))
 
 # %% [markdown]
-# The filter is within 2 cm of the truth, and better than its odometry.
+# The filter's place is within 2 cm of the truth, and nearer than odometry's. Its orientation is not: 0.13° against
+# 0.11°. In forty frames this odometry turns from the truth by little more than a tenth of a degree, to which the images
+# add nothing that shows. One draw of noise does not settle either; over twelve of them, in
+# `tests/recorded/test_filtered.py`, place is better by more than chance.
 
 # %%
 assert error.absolute["none"].rmse_m < 0.02
 assert error.absolute["none"].rmse_m < alone.absolute["none"].rmse_m
+assert np.allclose([error.absolute["none"].rmse_deg, alone.absolute["none"].rmse_deg], [0.13, 0.11], atol=0.01)
 
 # %% [markdown]
 # Of the tracks that the gate has judged, those on the two moving patches rank above the others by their largest margin:

@@ -19,12 +19,13 @@ from vcjax.sources.tracks import recording_from_tracks
 module._first = jax.jit(module._first.__wrapped__, compiler_options=QUICK)
 module._advance = jax.jit(module._advance.__wrapped__, compiler_options=QUICK)
 
-OPTIONS = ["--max-landmarks", "40", "--choose-among", "measured", "--births-per-frame", "2"]
+OPTIONS = ["--max-landmarks", "40", "--choose-among", "measured", "--births-per-frame", "3", "--pixel-std-px", "0.5"]
 
 
 def config(**options) -> vc.FilterConfig:
     """The configuration of `OPTIONS`."""
-    return vc.FilterConfig(**{"max_landmarks": 40, "choose_among": "measured", "births_per_frame": 2, **options})
+    given = {"max_landmarks": 40, "choose_among": "measured", "births_per_frame": 3, "pixel_std_px": 0.5}
+    return vc.FilterConfig(**given | options)
 
 
 @cache
@@ -50,3 +51,8 @@ def recording_path() -> Path:
 def run() -> Filtered:
     """It, filtered by the VC gate."""
     return filter_recording(config(), load_recording(recording_path()).recording)
+
+
+def position_rms(path: np.ndarray) -> float:
+    """RMS distance of a path of the robot from the true one, m."""
+    return float(np.sqrt(np.mean(np.sum((path[:, :3] - rendered().truth.robot[:, :3]) ** 2, axis=1))))

@@ -216,7 +216,10 @@ def test_interruption_is_told_without_a_traceback(monkeypatch, capsys, tmp_path)
 
     monkeypatch.setattr("vcjax.commands.paper.reproduce", interrupt)
     assert main(["reproduce", "--out", str(tmp_path)]) == 130
-    assert "stopped; what `reproduce`, `detect`, `tune`, `sweep` and `run` have finished is on disk" in said(capsys)[1]
+    assert (
+        "stopped; what `reproduce`, `detect`, `tune`, `sweep` and `run` have saved until now is on disk"
+        in said(capsys)[1]
+    )
 
 
 @pytest.mark.parametrize(

@@ -57,8 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         say(
             console,
-            "vcjax: stopped; what `reproduce`, `detect`, `tune`, `sweep` and `run` have finished is on disk, and they "
-            "go on there.",
+            "vcjax: stopped; what `reproduce`, `detect`, `tune`, `sweep` and `run` have saved until now is on disk, "
+            "and they go on there.",
         )
         return 130
     return 0

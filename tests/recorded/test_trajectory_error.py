@@ -95,6 +95,30 @@ def test_poses_are_compared_by_time_where_there_is_one_and_by_number_where_not()
     assert by_number.num_poses == 400 and by_number.absolute["none"].max_m < 1e-9
 
 
+def test_gaps_in_the_truth_are_not_stepped_over():
+    """Steps, path length and stretches are those of the parts that are known, here by evaluating each by itself."""
+    true = path()
+    estimate = moved(true, Rotation.identity(), 0.0, 1.02)
+    unknown = true.poses.copy()
+    unknown[150:180] = unknown[[299, 301]] = np.nan  # frame 300 is alone
+    found = trajectory_error(estimate, Trajectory(unknown, true.time_s))
+    step = np.linalg.norm(np.diff(true.poses[:, :3], axis=0), axis=1)
+    known = np.concatenate([step[:149], step[180:298], step[302:]])
+    assert found.step_rmse_m == pytest.approx(0.02 * np.sqrt(np.mean(known**2)))
+    assert found.path_m == pytest.approx(known.sum()) and found.num_poses == 368
+    assert found.drift_m_per_100_m <= 2.02  # per 100 m of the path; what spans the gap is not of that length
+    without = [np.r_[0:150], np.r_[180:299], [300], np.r_[302:400]]
+    file = Trajectory(*(np.concatenate([x[part] for part in without]) for x in true))  # rows that lack, in place of NaN
+    assert trajectory_error(estimate, file) == found
+
+
+def test_truth_of_every_other_frame_is_no_gap():
+    true = path()
+    found = trajectory_error(moved(true, Rotation.identity(), 0.0, 1.02), Trajectory(true.poses[::2], true.time_s[::2]))
+    step = np.linalg.norm(np.diff(true.poses[::2, :3], axis=0), axis=1)
+    assert found.num_poses == 200 and found.step_rmse_m == pytest.approx(0.02 * np.sqrt(np.mean(step**2)))
+
+
 def test_what_cannot_be_compared_is_refused():
     true = path()
     with pytest.raises(ValueError, match=r"fewer than two poses .* the estimate is of 1010\.0 to .*truth of 10\.0 to"):
@@ -127,3 +151,4 @@ def test_a_robot_that_stands_has_no_drift():
     poses = np.tile([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0], (5, 1))
     found = trajectory_error(Trajectory(poses), Trajectory(poses))
     assert math.isnan(found.drift_m_per_100_m) and found.absolute["none"].rmse_m == 0.0
+    assert trajectory_error_text(found).splitlines()[-1].endswith("not determined: the path is too short")

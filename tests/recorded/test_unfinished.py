@@ -1,6 +1,7 @@
 """A run that is stopped goes on where it was, to the same numbers; another run is refused."""
 
 import dataclasses
+import json
 import os
 import signal
 import subprocess
@@ -58,6 +59,8 @@ def test_stopped_and_gone_on_is_the_same_to_the_bit(tmp_path):
         with pytest.raises(Stopped):
             run(folder, stop_after(until))
     begun = unfinished(folder).read()
+    settings = json.loads((folder / "settings.json").read_text(), parse_constant=pytest.fail)
+    assert settings["config"]["blacklist_frames"] is None  # JSON knows no infinity
     assert begun.next_frame == 16 and begun.run_s > 0  # the last stretch was not written when it was stopped
     done = []
     assert_same(run(folder, lambda *counts: done.append(counts)), whole)
@@ -75,6 +78,8 @@ def test_another_run_is_refused_and_damage_is_said(tmp_path):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ValueError, match=r"unfinished has other settings \(config: .*give another directory"):
         run(folder, gate=vc.VirtualCorrection(th1=5.0))
+    with pytest.raises(ValueError, match=r"unfinished has other settings \(config: .*give another directory"):
+        run(folder, blacklist_frames=50.0)
     recording = recorded.content().recording
     uv_px = np.array(recording.uv_px)
     uv_px[3, 2] += 0.25

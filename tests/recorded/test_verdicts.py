@@ -127,9 +127,11 @@ def test_summary_by_hand(info):
         "failures         none",
     ):
         assert words in text
+    assert "place at the end known to " in text and " m, by the filter's own" in text
     assert "scale  " not in text and "cut at" not in text  # of the command alone
     more = run_summary_text(found | {"scale": "free", "scale_factor": 1.0, "tracks_cut": 7})
-    assert "free: lengths are those of the priors" in more and "cut at 7 sightings" in more
+    assert "free: lengths are those of the priors" in more and " of the priors' lengths, by the filter's own" in more
+    assert "cut at 7 sightings" in more
     assert "from 1 m; lengths are multiplied by 2.5" in run_summary_text(
         found | {"scale": "known from 1 m", "scale_factor": 2.5}
     )

@@ -1,11 +1,15 @@
 """Pictures of features: the colours are where the features are, and tell what was said of them."""
 
+import dataclasses
+from pathlib import Path
+
 import cv2
 import numpy as np
 import PIL.Image
 import pytest
 import recorded
 
+import vcjax as vc
 from vcjax.recorded.verdicts import Verdicts, verdicts
 from vcjax.report.feature_pictures import _LEGEND_PX, STATUSES, FeaturePictures
 from vcjax.report.path_view import path_figure
@@ -78,19 +82,30 @@ def test_plain_axes_without_images():
     assert image.shape == (480 + _LEGEND_PX, 640, 3) and np.median(image) == 255
     told = recorded.content()._replace(image_paths=("nowhere.png",) * 30)
     pictures = drawn(told)
-    assert pictures.missing_image() == recorded.recording_path().parent / "nowhere.png"
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.png: no such image"):
-        pictures.picture(0)
-    pictures.on_plain_axes()
     np.testing.assert_array_equal(rgb(pictures.picture(0)), image)
-    assert drawn().missing_image() is None
+    assert pictures.unread == {0: f"{recorded.recording_path().parent / 'nowhere.png'}: no such image."}
 
 
-def test_image_of_another_size_is_refused(tmp_path):
-    path = tmp_path / "small.png"
-    cv2.imwrite(str(path), np.zeros((10, 20), np.uint8))
-    with pytest.raises(ValueError, match=r"small\.png: 20 × 10 pixels, but the calibration is of 320 × 240"):
-        drawn(recorded.content()._replace(image_paths=(str(path),) * 30)).picture(0)
+def test_a_camera_of_any_shape_is_drawn_small():
+    """No file asks for a picture that memory does not hold."""
+    content = recorded.content()
+    for size in ((1.0, 32768.0), (32768.0, 1.0)):
+        recording = dataclasses.replace(content.recording, camera=vc.Camera(image_size_px=size))
+        pictures = drawn(content._replace(recording=recording, image_paths=None, calibration=None))
+        assert max(pictures.picture(0).size) <= 8192 + _LEGEND_PX
+        assert max(pictures.picture(0, 640 / 32768).size) <= 640 + _LEGEND_PX
+
+
+def test_images_that_cannot_be_read_are_told_and_the_others_drawn(tmp_path):
+    small, damaged = tmp_path / "small.png", tmp_path / "damaged.png"
+    cv2.imwrite(str(small), np.zeros((10, 20), np.uint8))
+    damaged.write_bytes(Path(recorded.content().image_paths[2]).read_bytes()[:2000])
+    good = recorded.content().image_paths
+    pictures = drawn(recorded.content()._replace(image_paths=(good[0], str(small), str(damaged), *good[3:])))
+    assert [np.median(rgb(pictures.picture(t))) == 255 for t in range(4)] == [False, True, True, False]
+    assert set(pictures.unread) == {1, 2}
+    assert pictures.unread[1].startswith(f"{small}: 20 × 10 pixels, but the calibration is of 320 × 240")
+    assert pictures.unread[2].startswith(f"{damaged}: ")
 
 
 def test_animations_hold_the_frames(tmp_path):

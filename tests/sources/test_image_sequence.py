@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 from pictures import CALIBRATION, picture, poses_at, write_images
+from scipy.spatial.transform import Rotation
 
-from vcjax.sources.image_sequence import ImageSequence, PoseTruth, interpolated, record
+from vcjax.sources.image_sequence import (
+    ImageSequence,
+    PoseTruth,
+    camera_of_robot,
+    interpolated,
+    record,
+    robot_of_camera,
+)
 from vcjax.sources.layouts import plain_folder
 
 
@@ -71,3 +79,24 @@ def test_sequences_that_do_not_fit_are_refused(tmp_path):
         ImageSequence(paths, np.arange(3.0), CALIBRATION)
     with pytest.raises(ValueError, match=r"0\.0 s, of .*b\.png, is not above"):
         ImageSequence(paths, np.zeros(2), CALIBRATION)
+
+
+def test_poses_of_camera_and_robot_are_each_others():
+    """By matrices, and back; what is not known stays so."""
+    turns = Rotation.random(8, rng=0).as_quat(scalar_first=True)
+    poses = np.column_stack([np.arange(24.0).reshape(8, 3), turns])
+    robot, mount = poses[:4], poses[4:]
+    robot[2] = np.nan
+
+    def matrix(pose):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix(), pose[:3]
+        return T
+
+    camera = camera_of_robot(robot, mount)
+    for t in (0, 1, 3):
+        np.testing.assert_allclose(matrix(camera[t]), matrix(robot[t]) @ matrix(mount[t]), atol=1e-12)
+    assert np.isnan(camera[2]).all()
+    back = robot_of_camera(camera, mount)
+    back[:, 3:] *= np.sign(np.sum(back[:, 3:] * robot[:, 3:], axis=1, keepdims=True))
+    np.testing.assert_allclose(back, robot, atol=1e-12)

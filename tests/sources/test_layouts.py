@@ -199,6 +199,24 @@ def test_plain_folder(tmp_path, inner):
         plain_folder(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"{t}.png" for t in range(12)],
+        [f"b2_{t:02d}.png" for t in range(9, 12)],
+        ["1305031102.175304.png", "1305031102.5.png", "1305031103.0.png"],  # times
+        ["1403636579763555584.png", "1403636579763555585.png", "1403636580000000000.png"],
+        ["01.jpg", "1.PNG", "1a.png", "a.png"],
+        ["left-1.png", "left-2.png", "left-10.png", "right-1.png"],
+    ],
+)
+def test_images_come_in_the_order_of_the_numbers_in_their_names(tmp_path, names):
+    for name in (*reversed(names), ".hidden.png", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    found = [path.name for path in plain_folder(tmp_path, CALIBRATION, 1.0).paths]
+    assert found == names
+
+
 def test_folders_without_what_is_needed(tmp_path):
     with pytest.raises(FileNotFoundError, match="none: no such folder"):
         plain_folder(tmp_path / "none", CALIBRATION, 1.0)

@@ -3,10 +3,12 @@
 import dataclasses
 
 import numpy as np
+import recorded
 from rendered import rendered, tracked
 from test_recording import good_recording
 from test_recording_file import full
 
+from vcjax.sources.odometry import Odometry
 from vcjax.sources.overview import draw_overview, summary
 from vcjax.sources.recording_file import RecordingFile
 from vcjax.sources.tracks import recording_from_tracks
@@ -45,7 +47,30 @@ def test_recordings_without_anything():
     found = said(empty)
     assert found["tracks"] == "0, 0 sightings" and "5 frames without any" in found["seen per frame"]
     assert found["odometry"].startswith("none (standard deviations")
-    draw_overview(empty)
+    path = draw_overview(empty).axes[3]
+    assert not path.lines and path.get_legend() is None and path.texts[0].get_text() == "neither odometry nor truth"
+
+
+def test_picture_has_the_pixels_of_the_images():
+    """Tracks begin where they do in the image, and not where the straightened image has them."""
+    tracks = tracked()
+    lens = dataclasses.replace(rendered().sequence.calibration, distortion_model="wide_angle", distortion=(4e-6,))
+    odometry = Odometry(*(np.asarray(x) for x in (rendered().simulated.odometry, rendered().simulated.odometry_cov)))
+    recording = recording_from_tracks(tracks, lens, time_s=rendered().sequence.time_s, odometry=odometry)
+    image = draw_overview(RecordingFile(recording, calibration=lens)).axes[2]
+    first = np.unique(tracks.track_id, return_index=True)[1]
+    drawn = np.asarray(image.collections[0].get_offsets())
+    np.testing.assert_allclose(np.sort(drawn, axis=0), np.sort(tracks.uv_px[first], axis=0), atol=0.01)
+    assert image.get_xlim() == (0, 320) and image.get_ylim() == (240, 0)
+
+
+def test_bars_of_track_lengths_reach_halfway_to_their_neighbours():
+    """On an axis of powers, where the bar at 1 reaches from 1/√2 to √2."""
+    lengths = draw_overview(recorded.content()).axes[1]
+    edges = np.array([(bar.get_x(), bar.get_x() + bar.get_width()) for bar in lengths.patches])
+    assert np.all(edges[:, 1] / edges[:, 0] < 2.001) and sum(bar.get_height() for bar in lengths.patches) == len(
+        np.unique(tracked().track_id)
+    )
 
 
 def test_picture_shows_what_there_is(tmp_path):

@@ -14,12 +14,17 @@ from vcjax.models.frames import compose
 from vcjax.recording import Truth
 from vcjax.sources.calibration import Calibration
 from vcjax.sources.distortion import denormalise
+from vcjax.sources.image_sequence import camera_of_robot
 from vcjax.sources.recording_file import TrackLabel
-from vcjax.sources.render import Surface, camera_poses, cast, render, rough_texture, surfaces_of
+from vcjax.sources.render import Surface, cast, render, rough_texture, surfaces_of
 from vcjax.sources.rendered_sequence import render_sequence
 
 CAMERA = Calibration(160, 120, 150.0, 140.0, 80.0, 58.0)
 ORIGIN = np.array([0.0, 0, 0, 1, 0, 0, 0])  # looks along z, x right, y down
+
+
+def camera_poses(truth) -> np.ndarray:
+    return camera_of_robot(truth.robot, truth.sensor)
 
 
 def upright(depth, left=-0.5, top=-0.5, size=1.0, grey=255, velocity=(0.0, 0, 0)) -> Surface:

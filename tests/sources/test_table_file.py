@@ -32,9 +32,10 @@ def test_numbers_come_back_bit_for_bit(tmp_path_factory, ending, rows):
         "frame,u\n1,0.5\n2,7\n",
         "u,frame\n0.5,1\n7e0,2",
         "\ufeff frame , u ,,\r\n 1, 0.5,a,\r\n 2 ,7.0 ,b,\r\n",
+        "frame,u,name\n1,0.5,0x10\n2,7,0x11\n",
         '"frame","u","what ""it"" is"\n"1","0.5","x, y"\n"2","7","z"\n',
     ],
-    ids=["plain", "other order", "spaces, mark and returns", "quoted"],
+    ids=["plain", "other order", "spaces, mark and returns", "hexadecimal elsewhere", "quoted"],
 )
 def test_ways_of_writing_the_same(tmp_path, text):
     (tmp_path / "a.CSV").write_text(text, newline="")
@@ -59,6 +60,11 @@ BAD_CSV = {
     "too large": (f"frame,u\n1,0.5\n{2**63},1\n", "line 3, column frame: '9223372036854775808' is not a whole"),
     "too large a number": ("frame,u\n1,1e400\n", r"line 2, column u: inf is not finite; leave out rows"),
     "NaN": ("frame,u\n1,0.5\n2,nan\n3,nan\n", r"line 3, column u: nan is not finite; .*\(2 such rows\)"),
+    "hexadecimal": ("frame,u,name\n1,0.5,0x3\n0X10,7,\n", r"line 3, column frame: '0X10' is not a whole number"),
+    "open quote": (
+        "frame,u\n" + "1,0.5\n" * 300_000 + '2,"7\n' + "3,0.5\n" * 300_000,
+        "line 300002: .*quote.*not closed",
+    ),
     "short row": ("frame,u\n1,0.5\n2\n", "line 3: 1 cells, but the header names 2 columns"),
     "long row": ("frame,u\n1,0.5\n2,3,4\n", "line 3: 3 cells, but"),
     "empty line": ("frame,u\n1,0.5\n\n2,0.5\n", "line 3(: 1 cells|, column frame: '' is)"),

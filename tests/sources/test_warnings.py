@@ -4,9 +4,13 @@ import dataclasses
 
 import numpy as np
 import recorded
+from rendered import rendered, tracked
 
 from vcjax.recording import last_sightings
+from vcjax.sources.distortion import straighten
+from vcjax.sources.odometry import Odometry
 from vcjax.sources.overview import summary
+from vcjax.sources.tracks import recording_from_tracks
 from vcjax.sources.warnings import empty_frames, time_jumps, unfollowed_frames, warnings
 
 
@@ -48,3 +52,31 @@ def test_repeats_and_no_odometry():
     told = warnings(dataclasses.replace(found, odometry=np.zeros((30, 6))))
     assert told[0].startswith("frame 12: most tracks repeat the frame before") and "--cut-repeats" in told[0]
     assert told[-1].startswith("no odometry: run with --motion constant_velocity")
+
+
+def test_pixels_outside_the_image():
+    """As a calibration of a smaller image makes them; up to a pixel beyond the border nothing is said."""
+    uv_px, is_valid = np.array(recorded.content().recording.uv_px), np.array(recorded.content().recording.is_valid)
+    u = uv_px[..., 0]  # a view
+    u[is_valid] = u[is_valid].clip(0, 319)
+    u[3, np.flatnonzero(is_valid[3])[:2]], u[9, np.flatnonzero(is_valid[9])[0]] = (400.0, -50.0), 320.5
+    u[4, np.flatnonzero(~is_valid[4])] = 1000.0  # is no pixel
+    assert warnings(changed(uv_px=uv_px)) == [
+        "2 sightings of " + str(is_valid.sum()) + " lie outside the image (320 × 240 px): is this the calibration "
+        "of these images?"
+    ]
+
+
+def test_sightings_that_the_lens_has_no_place_for():
+    """They stay out of the recording, and are counted."""
+    tracks, straight = tracked(), rendered().sequence.calibration
+    # No ray beyond 158 px from the centre.
+    lens = dataclasses.replace(straight, distortion_model="wide_angle", distortion=(2e-5,))
+    recording = recorded.content().recording
+    odometry = Odometry(recording.odometry, recording.odometry_cov)
+    found = recording_from_tracks(tracks, lens, time_s=recording.time_s, odometry=odometry)
+    num = int(np.sum(np.isnan(straighten(lens, tracks.uv_px)[:, 0])))
+    assert 0 < num < len(tracks.frame) == num + found.is_valid.sum()
+    assert warnings(found) == [
+        f"{num} sightings are left out, as the lens of the calibration has no place for their pixels"
+    ]

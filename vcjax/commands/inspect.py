@@ -24,8 +24,8 @@ class Inspect:
 
     def __call__(self, console: Console) -> None:
         """Read, print, draw."""
-        picture = self.picture or self.recording.with_name(f"{self.recording.stem}_overview.png")
         content = load_recording(self.recording)
+        picture = self.picture or self.recording.with_name(f"{self.recording.stem}_overview.png")
         check_writable(picture)
         print(summary(content))
         say(console, f"wrote {write_picture(draw_overview(content), picture)}")

@@ -19,7 +19,7 @@ from vcjax.recorded import run_folder
 from vcjax.recorded.filtered import Filtered, filter_recording
 from vcjax.recorded.run_summary import run_summary, run_summary_text
 from vcjax.recorded.scale import KnownDistance, check_known_distance, found_distance, scale_source, scaled
-from vcjax.recorded.unfinished import Unfinished
+from vcjax.recorded.unfinished import Unfinished, digest
 from vcjax.recorded.verdicts import Verdicts, track_verdicts, verdicts
 from vcjax.report.feature_pictures import FeaturePictures
 from vcjax.report.path_view import path_figure
@@ -29,6 +29,7 @@ from vcjax.sources.map_file import LandmarkMap
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, load_recording
 from vcjax.sources.repeats import CutRecording, cut_recording
+from vcjax.sources.warnings import NO_ODOMETRY
 from vcjax.storage import check_writable
 from vcjax.study.results import describe
 
@@ -96,6 +97,8 @@ class Run:
         source = scale_source(self.config.motion, content.recording, known)
         if distance is not None:
             check_known_distance(distance, content.recording, source)
+        if self.config.motion.gives_scale and not np.any(np.asarray(content.recording.odometry)):
+            say(console, NO_ODOMETRY)
         cut = cut_recording(content.recording) if self.cut_repeats else None
         recording = content.recording if cut is None else cut.recording
         unfinished = Unfinished(out / "unfinished", self.config, recording, known)
@@ -114,7 +117,11 @@ class Run:
         cuts = {"tracks_cut": None if cut is None else cut.num_cuts}
         summary: dict[str, Any] = run_summary(self.config, content.recording, filtered, tracks) | scale | cuts
         print(run_summary_text(summary), flush=True)
-        provenance = {"recording": str(self.recording.absolute()), "config": describe(self.config)}
+        provenance = {
+            "recording": str(self.recording.absolute()),
+            "recording_sha256": digest(content.recording),
+            "config": describe(self.config),
+        }
         with (
             run_folder.new_run(
                 out, content.recording, filtered, passed, tracks, summary | provenance, self.table
@@ -141,9 +148,6 @@ class Run:
     def _draw_features(self, content: RecordingFile, passed: Verdicts, new: Path, console: Console, show) -> None:
         """Pictures of some frames, and the animation."""
         drawn = FeaturePictures(content, passed, self.recording.absolute().parent)
-        if (missing := drawn.missing_image()) is not None:
-            say(console, f"{missing}: no such image; features are drawn on plain axes.")
-            drawn.on_plain_axes()
         num_frames = content.recording.num_frames
         alone, moving = _spread(num_frames, self.pictures), range(0)
         if self.animation != "none":
@@ -155,6 +159,10 @@ class Run:
         if moving:
             path = new / f"features.{self.animation}"
             drawn.write_animation(moving, path, lambda done, _: show(len(alone) + done, num))
+        if drawn.unread:
+            t, why = min(drawn.unread.items())
+            counted = f"{len(drawn.unread)} frames, first " if len(drawn.unread) > 1 else ""
+            say(console, f"drawn on plain axes: {counted}frame {t}: {why}")
 
 
 def _by_tracks(filtered: Filtered, cut: CutRecording) -> Filtered:

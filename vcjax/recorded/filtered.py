@@ -1,7 +1,8 @@
 """A recording, filtered: what every frame showed, and where each landmark was when it was last held.
 
 The recording goes through the filter in stretches, so that the device holds a part of it only, and the landmarks that
-leave the map, retired or deleted, stay known by their last mean and covariance.
+leave the map, retired or deleted, stay known by their last mean and covariance. What is kept of a frame is what results
+are made of; whoever wants all of it iterates over `run_in_stretches`.
 """
 
 import time
@@ -21,6 +22,11 @@ from vcjax.filter.stretches import STRETCH, run_in_stretches
 from vcjax.recorded.unfinished import Unfinished, first_frames
 from vcjax.recording import Recording
 
+_LEFT_OUT = (
+    "carried", "carried_std", "pixel", "innovation", "innovation_cov", "re1_prior", "p_dynamic", "detector",
+    "p_detector", "departed",
+)  # fmt: skip
+
 
 class LastPlaces(NamedTuple):
     """Landmarks as points of the world, as they were when they left the map or the recording ended."""
@@ -37,8 +43,9 @@ class Filtered(NamedTuple):
     """What a filter made of a recording."""
 
     info: FrameInfo
-    """Of every frame, leading axis T, NumPy arrays; without the landmarks that left the map, which are in
-    `landmarks`."""
+    """Of every frame, leading axis T, NumPy arrays; None for what no result is made of: the state of the detector,
+    soft verdicts, innovations and pixels (RE₁ is there), what the motion model carries, and the landmarks that left the
+    map, which are in `landmarks`."""
     landmarks: LastPlaces
     """Every landmark that was ever born; of one born again its last life."""
     compile_s: float
@@ -67,7 +74,7 @@ def filter_recording(
             configuration and recording. It stays until whoever asked removes it.
         length: most frames in a stretch; work is written between two of them.
 
-    Returns: infos as `vcjax.run` gives them, the map, and the time that it took.
+    Returns: infos as `vcjax.run` gives them, less what `Filtered` leaves out, the map, and the time that it took.
 
     Raises:
         ValueError: for a recording that no filter can run on, a configuration that needs a key, or unfinished work of
@@ -83,17 +90,17 @@ def filter_recording(
         pass
     compiled = time.perf_counter()
 
-    infos, last, state, next_frame, before_s = [], _LastPlaces(), None, 0, 0.0
+    infos, last, state, next_frame, before_s = _Infos(recording.num_frames), _LastPlaces(), None, 0, 0.0
     if begun is not None:
         next_frame, before_s, state, _ = begun
         for info in begun.infos:
             last.note(info.departed)
-            infos.append(_without_departed(info))
+            infos.append(info)
     unsaved, saved = [], compiled
     going_on = {"length": length, "state": state, "next_frame": next_frame}
     for stretch in run_in_stretches(config, recording, known=known, **going_on):
         last.note(stretch.info.departed)
-        infos.append(_without_departed(stretch.info))
+        infos.append(stretch.info)
         if progress is not None:
             progress(stretch.next_frame, recording.num_frames)
         state = stretch.state
@@ -105,11 +112,7 @@ def filter_recording(
                 unfinished.write(unsaved[0].first_frame, _joined([s.info for s in unsaved]), state, done_s)
                 unsaved, saved = [], time.perf_counter()
     last.note(_points(state))
-    return Filtered(_joined(infos), last.known(), compiled - begin, before_s + time.perf_counter() - compiled)
-
-
-def _without_departed(info: FrameInfo) -> FrameInfo:
-    return eqx.tree_at(lambda info: info.departed, info, None)
+    return Filtered(infos.whole, last.known(), compiled - begin, before_s + time.perf_counter() - compiled)
 
 
 def _joined(infos: list[FrameInfo]) -> FrameInfo:
@@ -119,6 +122,25 @@ def _joined(infos: list[FrameInfo]) -> FrameInfo:
 @jax.jit
 def _points(state) -> LandmarkPoints:
     return landmark_points(state)
+
+
+class _Infos:
+    """Collects what is kept of the infos, in arrays of the whole length."""
+
+    whole: FrameInfo
+
+    def __init__(self, num_frames: int):
+        self.num_frames, self.next_frame = num_frames, 0
+
+    def append(self, info: FrameInfo) -> None:
+        """Keep those of the frames that follow."""
+        kept = eqx.tree_at(lambda info: [getattr(info, name) for name in _LEFT_OUT], info, [None] * len(_LEFT_OUT))
+        if self.next_frame == 0:
+            self.whole = jax.tree.map(lambda leaf: np.empty((self.num_frames, *leaf.shape[1:]), leaf.dtype), kept)
+        frames = slice(self.next_frame, self.next_frame + len(info.is_finite))
+        for all_, some in zip(jax.tree.leaves(self.whole), jax.tree.leaves(kept), strict=True):
+            all_[frames] = some
+        self.next_frame = frames.stop
 
 
 class _LastPlaces:

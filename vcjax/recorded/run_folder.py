@@ -28,10 +28,11 @@ from vcjax.recorded.filtered import Filtered
 from vcjax.recorded.followed import Followed, followed
 from vcjax.recorded.verdicts import VERDICTS, TrackVerdicts, Verdicts, classes
 from vcjax.recording import Recording
+from vcjax.sources.image_sequence import camera_of_robot
 from vcjax.sources.map_file import LandmarkMap, write_map
 from vcjax.sources.table_file import Kind, read_table, write_table
 from vcjax.sources.trajectory_file import read_tum, write_kitti, write_tum
-from vcjax.storage import filling, write_file
+from vcjax.storage import filling, write_json
 
 TableFormat = Literal["csv", "parquet"]
 TABLES, ENDINGS = ("landmarks", "verdicts", "tracks", "followers"), ("csv", "parquet")
@@ -52,7 +53,7 @@ class RunFolder(NamedTuple):
     tracks: TrackVerdicts
     """What became of each track."""
     summary: dict[str, Any]
-    """Numbers of the run; "recording" is the file that it read."""
+    """Numbers of the run; "recording" is the file that it read, "recording_sha256" the `digest` of what it held."""
 
 
 def landmark_map(filtered: Filtered, tracks: TrackVerdicts) -> LandmarkMap:
@@ -67,13 +68,7 @@ def robot_poses(info: FrameInfo) -> Float[np.ndarray, "T 7"]:
 
 def camera_poses(info: FrameInfo) -> Float[np.ndarray, "T 7"]:
     """Estimated poses T_w_c = T_w_r T_r_s of the camera in each frame."""
-    from scipy.spatial.transform import Rotation
-
-    robot, sensor = np.split(np.array(info.vehicle, np.float64), 2, axis=1)
-    turn = Rotation.from_quat(robot[:, 3:], scalar_first=True)
-    place = robot[:, :3] + turn.apply(sensor[:, :3])
-    turn = turn * Rotation.from_quat(sensor[:, 3:], scalar_first=True)
-    return np.column_stack([place, turn.as_quat(scalar_first=True)])
+    return camera_of_robot(*np.split(np.asarray(info.vehicle), 2, axis=1))
 
 
 @contextlib.contextmanager
@@ -117,8 +112,7 @@ def new_run(
         if (moving := followed(filtered.info)) is not None:
             write_table(new / f"followers.{table}", _columns(moving))
         yield new
-        shown = {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in summary.items()}
-        write_file(new / _SUMMARY, f"{json.dumps(shown, indent=1)}\n".encode())
+        write_json(new / _SUMMARY, summary)
 
 
 def _columns(moving: Followed) -> dict[str, np.ndarray]:

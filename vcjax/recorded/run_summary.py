@@ -88,6 +88,7 @@ def run_summary_text(found: dict[str, Any]) -> str:
     """The numbers in words, a line for each thing to know."""
     within = found["nis_low"] <= found["nis"] <= found["nis_high"]
     is_expected = not math.isnan(found["nis_low"])
+    unit = "of the priors' lengths" if found.get("scale") == "free" else "m"
     failed = "none" if found["first_failure"] is None else f"not finite from frame {found['first_failure']} on"
     rows = [
         (
@@ -123,7 +124,7 @@ def run_summary_text(found: dict[str, Any]) -> str:
                 else ""
             ),
         ),
-        ("place at the end", f"known to {found['end_std_m']:.3g} m, by the filter's own covariance"),
+        ("place at the end", f"known to {found['end_std_m']:.3g} {unit}, by the filter's own covariance"),
         ("failures", failed),
     ]
     if found.get("scale") is not None:

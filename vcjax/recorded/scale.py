@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 
 from vcjax.filter.known_landmarks import KnownLandmarks
 from vcjax.filter.motion_model import AbstractMotion
 from vcjax.recorded.filtered import Filtered, LastPlaces
 from vcjax.recording import Recording
+from vcjax.sources.image_sequence import camera_of_robot
 
 
 class KnownDistance(NamedTuple):
@@ -83,7 +83,7 @@ def scaled(filtered: Filtered, factor: float) -> Filtered:
     carries is left as the filter had it.
     """
     vehicle = np.array(filtered.info.vehicle, np.float64)
-    place = camera_place(vehicle)
+    place = camera_of_robot(*np.split(vehicle, 2, axis=1))[:, :3]
     moved = (factor - 1.0) * (place - place[0])
     vehicle[:, :3] += moved
     cov = np.array(filtered.info.vehicle_cov, np.float64)
@@ -104,11 +104,3 @@ def scaled(filtered: Filtered, factor: float) -> Filtered:
     return filtered._replace(
         info=info, landmarks=LastPlaces(landmarks.track_id, places, factor**2 * np.asarray(landmarks.cov))
     )
-
-
-def camera_place(vehicle: Float[np.ndarray, "T 14"]) -> Float[np.ndarray, "T 3"]:
-    """Place of the camera in the world, of poses of robot and sensor."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_quat(vehicle[:, 3:7], scalar_first=True)
-    return vehicle[:, :3] + turn.apply(vehicle[:, 7:10])

@@ -4,13 +4,14 @@ The absolute pose error (APE) of a frame is the distance from the true place, an
 It depends on how the two worlds are laid on each other, and so it is given for each way to do that: not at all, by the
 first pose, by the rigid motion that fits best (Umeyama 1991), and by the best similarity, where a scale is free too.
 The relative pose error (RPE) compares motions, from each pose to the one a given way further on, and needs no common
-world; a wrong scale it sees.
+world; a wrong scale it sees. It does not step over gaps, where time steps by `warnings.JUMP` times the median or more.
 
 Sources: Sturm et al., IROS 2012; Grupp 2017, *evo*.
 """
 
 import contextlib
 import copy
+import itertools
 import math
 from typing import Any, Literal, NamedTuple
 
@@ -18,12 +19,14 @@ import numpy as np
 from jaxtyping import Float
 
 from vcjax import extras
+from vcjax.sources.warnings import JUMP
 
 Alignment = Literal["none", "first pose", "rigid", "similarity"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "first pose", "rigid", "similarity")
 DRIFT_M = 100.0
 """Length of the stretches over which drift is measured, m, where the path is long enough."""
 _NO_RIGID = "not determined: the places lie on a line"
+_NO_DRIFT = "not determined: the path is too short"
 MAX_TIME_DIFFERENCE_S = 0.01
 """How far apart the times of a pose and the true pose that it is compared with may be, s."""
 
@@ -54,7 +57,7 @@ class TrajectoryError(NamedTuple):
     num_poses: int
     """How many poses have a true one."""
     path_m: float
-    """Length of the true path, m."""
+    """Length of the true path, without gaps, m."""
     absolute: dict[Alignment, AbsoluteError]
     """NaN where an alignment is not determined."""
     step_rmse_m: float
@@ -81,23 +84,25 @@ def trajectory_error(estimate: Trajectory, truth: Trajectory) -> TrajectoryError
         ValueError: if fewer than two poses can be compared.
     """
     found, true = _associated(estimate, truth)
-    length = float(true.path_length)
+    pieces = _without_gaps(found, true)
+    length = float(sum(piece.path_length for _, piece in pieces))
     metrics, units = extras.load("evo.core.metrics", "Evaluations", "images"), _evo("evo.core.units")
     parts = (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg)
     absolute: dict[Alignment, AbsoluteError] = {
         alignment: _absolute(found, true, alignment, parts) for alignment in ALIGNMENTS
     }
-    steps = [metrics.RPE(part, 1, units.Unit.frames) for part in parts]
-    for step in steps:
-        step.process_data((true, found))
-    stretch = min(DRIFT_M, length / 4.0)
-    drift = _drift(found, true, stretch, parts)
+    step = [_relative(pieces, metrics.RPE(part, 1, units.Unit.frames)) for part in parts]
+    stretch, drift = min(DRIFT_M, length / 4.0), [math.nan] * 2
+    if stretch > 0:
+        options = {"all_pairs": True, "pairs_from_reference": True}
+        along = [_relative(pieces, metrics.RPE(part, stretch, units.Unit.meters, **options)) for part in parts]
+        drift = [float(np.mean(error)) * 100.0 / stretch if len(error) else math.nan for error in along]
     return TrajectoryError(
         num_poses=true.num_poses,
         path_m=length,
         absolute=absolute,
-        step_rmse_m=_rms(steps[0].error),
-        step_rmse_deg=_rms(steps[1].error),
+        step_rmse_m=_rms(step[0]),
+        step_rmse_deg=_rms(step[1]),
         drift_m_per_100_m=drift[0],
         drift_deg_per_100_m=drift[1],
         stretch_m=stretch,
@@ -123,8 +128,11 @@ def trajectory_error_text(found: TrajectoryError) -> str:
             )
         )
     rows.append(("RPE, each step", f"{found.step_rmse_m:.4g} m, {found.step_rmse_deg:.4g}° RMS; not aligned"))
-    drift = f"{found.drift_m_per_100_m:.4g} m, {found.drift_deg_per_100_m:.4g}° on average"
-    rows.append(("drift per 100 m", f"{drift}, from stretches of {found.stretch_m:.4g} m; not aligned"))
+    drift = (
+        f"{found.drift_m_per_100_m:.4g} m, {found.drift_deg_per_100_m:.4g}° on average, from stretches of "
+        f"{found.stretch_m:.4g} m; not aligned"
+    )
+    rows.append(("drift per 100 m", _NO_DRIFT if math.isnan(found.drift_m_per_100_m) else drift))
     return "\n".join(f"{name:26s} {text}" for name, text in rows)
 
 
@@ -188,20 +196,27 @@ def _absolute(found: Any, true: Any, alignment: Alignment, parts: tuple) -> Abso
     return AbsoluteError(_rms(distance), float(distance.mean()), float(distance.max()), _rms(angle), scale)
 
 
-def _drift(found: Any, true: Any, stretch_m: float, parts: tuple) -> tuple[float, float]:
-    """Mean RPE per 100 m over all stretches of a length along the true path."""
-    metrics, units, filters = _evo("evo.core.metrics"), _evo("evo.core.units"), _evo("evo.core.filters")
-    if stretch_m <= 0:
-        return math.nan, math.nan
-    drift = []
-    for part in parts:
-        rpe = metrics.RPE(part, stretch_m, units.Unit.meters, all_pairs=True, pairs_from_reference=True)
-        try:
+def _without_gaps(found: Any, true: Any) -> list[tuple[Any, Any]]:
+    """The pieces of both trajectories between gaps in time."""
+    step = np.diff(true.timestamps)
+    ends = [0, *(np.flatnonzero(step >= JUMP * np.median(step)) + 1).tolist(), true.num_poses]
+    pieces = []
+    for first, until in itertools.pairwise(ends):
+        piece = copy.deepcopy(found), copy.deepcopy(true)
+        for trajectory in piece:
+            trajectory.reduce_to_ids(np.arange(first, until))
+        pieces.append(piece)
+    return pieces
+
+
+def _relative(pieces: list[tuple[Any, Any]], rpe: Any) -> np.ndarray:
+    """All RPE of the pieces of a trajectory; empty where none is long enough."""
+    errors = [np.zeros(0)]
+    for found, true in pieces:
+        with contextlib.suppress(_evo("evo.core.filters").FilterException):
             rpe.process_data((true, found))
-        except filters.FilterException:
-            return math.nan, math.nan
-        drift.append(float(np.mean(rpe.error)) * 100.0 / stretch_m)
-    return drift[0], drift[1]
+            errors.append(np.asarray(rpe.error))
+    return np.concatenate(errors)
 
 
 def _rms(error: Any) -> float:

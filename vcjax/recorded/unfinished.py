@@ -16,7 +16,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +32,7 @@ from vcjax.filter.slam import start
 from vcjax.filter.state import FilterState
 from vcjax.recording import PER_FRAME, Recording
 from vcjax.sources.arrays_file import read_arrays, write_arrays
-from vcjax.storage import write_file
+from vcjax.storage import with_nulls, write_json
 from vcjax.study.results import describe, refuse_other_settings
 
 EVERY_S = 10.0
@@ -48,8 +48,8 @@ class Begun(NamedTuple):
     run_s: float
     """How long it took, s."""
     state: FilterState
-    infos: list[FrameInfo]
-    """Infos of all frames before, in pieces."""
+    infos: Iterator[FrameInfo]
+    """Infos of all frames before, in pieces, read as they are asked for; ValueError if one lacks or is damaged."""
 
 
 class Unfinished:
@@ -92,16 +92,20 @@ class Unfinished:
         if not isinstance(found, dict):
             raise ValueError(f"{self.folder / _SETTINGS}: not what a run left; {remedy}")
         refuse_other_settings(self.folder, found, self._settings)
-        shapes, infos, frame = self._shapes, [], 0
-        state, told = _read(path, shapes[0], {"next_frame": "iu", "run_s": "f"}, False)
-        next_frame, run_s = int(told["next_frame"]), float(told["run_s"])
+        state, told = _read(path, self._shapes[0], {"next_frame": "iu", "run_s": "f"}, False)
+        next_frame = int(told["next_frame"])
+        return Begun(next_frame, float(told["run_s"]), state, self._infos(next_frame, remedy))
+
+    def _infos(self, next_frame: int, remedy: str) -> Iterator[FrameInfo]:
+        frame = 0
         while frame < next_frame:
-            info, _ = _read(self._frames(frame), shapes[1], {}, True)
-            infos.append(info)
+            info, _ = _read(self._frames(frame), self._shapes[1], {}, True)
             frame += max(1, len(info.is_finite))
+            if frame > next_frame:
+                break
+            yield info
         if frame != next_frame:
             raise ValueError(f"{self.folder}: holds frames up to {frame - 1}, not {next_frame - 1}; {remedy}")
-        return Begun(next_frame, run_s, state, infos)
 
     def write(self, first_frame: int, info: FrameInfo, state: FilterState, run_s: float) -> None:
         """Keep some frames, and the state after them.
@@ -110,7 +114,7 @@ class Unfinished:
             OSError: if the place cannot be written; what was there before stays.
         """
         if first_frame == 0:
-            write_file(self.folder / _SETTINGS, f"{json.dumps(self._settings, indent=1)}\n".encode())
+            write_json(self.folder / _SETTINGS, self._settings)
         next_frame = first_frame + len(info.is_finite)
         write_arrays(self._frames(first_frame), _named(info))
         told = {"next_frame": np.array(next_frame), "run_s": np.array(run_s)}
@@ -134,16 +138,26 @@ def first_frames(recording: Recording, num: int) -> Recording:
     return eqx.tree_at(of_frames, recording, [leaf[:num] for leaf in of_frames(recording)])
 
 
+def digest(tree: PyTree) -> str:
+    """SHA-256 of all arrays of a recording, or of another tree, in hexadecimal: the same for the same numbers only."""
+    found = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        array = np.ascontiguousarray(leaf)
+        found.update(f"{array.dtype}{array.shape}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
+
+
 def _settings(config: FilterConfig, recording: Recording, known: KnownLandmarks | None) -> dict[str, Any]:
     """All that the numbers of a run depend on."""
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves((recording, known)):
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(array.tobytes())
     dtype = str(jax.dtypes.canonicalize_dtype(np.float64))
-    settings = {"config": describe(config), "recording and known landmarks": digest.hexdigest(), "dtype": dtype}
-    return json.loads(json.dumps(settings))  # as it is read
+    settings = {
+        "config": describe(config),
+        "recording and known landmarks": digest((recording, known)),
+        "dtype": dtype,
+    }
+    # As it is read: null stands for infinity, which no other value of the same field can be taken for.
+    return json.loads(json.dumps(with_nulls(settings)))
 
 
 def _named(tree: PyTree) -> dict[str, np.ndarray]:

@@ -29,6 +29,7 @@ _NUM_GREYS = 250
 _COLOURS = [*(CLASS_COLOURS[name] for name in ("accepted", "recovered", "dynamic")), (86, 180, 233), (240, 228, 66)]
 _BLACK, _WHITE = 0, _NUM_GREYS - 1
 _LEGEND_PX = 26
+_MOST_PX = 8192
 _GIF_WIDTH_PX, _GIF_GREYS = 640, 24
 
 
@@ -43,7 +44,10 @@ class Seen(NamedTuple):
 
 
 class FeaturePictures:
-    """Pictures of the frames of a recording with the verdicts of a run."""
+    """Pictures of the frames of a recording with the verdicts of a run.
+
+    A frame whose image cannot be read is drawn on plain axes, and `unread` tells why.
+    """
 
     def __init__(self, content: RecordingFile, passed: Verdicts, folder: Path, width_px: int = 720):
         """A picture of each frame can be asked for.
@@ -52,7 +56,8 @@ class FeaturePictures:
             content: the recording.
             passed: verdicts of a run over it.
             folder: where relative paths of its images begin.
-            width_px: least width of a picture; smaller images are enlarged by a whole number.
+            width_px: least width of a picture; smaller images are enlarged by a whole number, those with a side of
+                more than 8192 px shrunk.
         """
         self.content, self.folder = content, folder
         calibration = content.calibration
@@ -63,20 +68,13 @@ class FeaturePictures:
         else:
             self.size, self.has_images = (calibration.width, calibration.height), True
             tracks = tracks_of(content.recording, calibration)
-        self.scale = float(max(1, -(-width_px // self.size[0])))
+        self.scale = min(float(max(1, -(-width_px // self.size[0]))), _MOST_PX / max(self.size))
+        self.unread: dict[int, str] = {}
+        """What was wrong with the images that could not be read, by frame, of those that were drawn."""
         self._tracks, self._passed = tracks, passed
         is_end = (passed.verdict == DYNAMIC) | (passed.verdict > REJECTED)
         # First frame in which each track was called dynamic or deleted.
         self._ended = dict(zip(passed.track_id[is_end][::-1], passed.frame[is_end][::-1], strict=True))
-
-    def missing_image(self) -> Path | None:
-        """The first image of the recording that is not there, if it has images."""
-        paths = [self._path(t) for t in range(self.content.recording.num_frames)] if self.has_images else []
-        return next((path for path in paths if not path.is_file()), None)
-
-    def on_plain_axes(self) -> None:
-        """Draw no images, though the recording names them."""
-        self.has_images = False
 
     def seen(self, t: int) -> Seen:
         """The features in frame t."""
@@ -95,19 +93,17 @@ class FeaturePictures:
             t: number of the frame.
             scale: pixels of the picture for each of the image; so many that it is wide enough if None.
             num_greys: how many greys the image has.
-
-        Raises:
-            FileNotFoundError, ValueError: if its image is not there, no image, or of another size.
         """
         pillow = extras.load("PIL.Image", "Pictures", "images")
         from PIL import ImageDraw
 
         scale = self.scale if scale is None else scale
-        size = round(self.size[0] * scale), round(self.size[1] * scale)
+        size = max(1, round(self.size[0] * scale)), max(1, round(self.size[1] * scale))
         canvas = pillow.new("L", (size[0], size[1] + _LEGEND_PX), _WHITE)
         draw = ImageDraw.Draw(canvas)
-        if self.has_images:
-            image = pillow.fromarray(self._grey(t)).resize(size, pillow.Resampling.BILINEAR)
+        grey = self._grey(t)
+        if grey is not None:
+            image = pillow.fromarray(grey).resize(size, pillow.Resampling.BILINEAR)
             image = image.point(lambda grey: round(grey * (num_greys - 1) / _WHITE) * _WHITE // (num_greys - 1))
             canvas.paste(image, (0, _LEGEND_PX))
         else:
@@ -165,14 +161,15 @@ class FeaturePictures:
             (_save_gif if is_gif else _save_video)(pictures(), temporary, step_s)
             return write_file(path, temporary.read_bytes())
 
-    def _path(self, t: int) -> Path:
-        """The image of frame t; relative paths begin at the recording's folder."""
-        assert self.content.image_paths is not None
-        return self.folder / self.content.image_paths[t]
-
-    def _grey(self, t: int) -> UInt8[np.ndarray, "height width"]:
-        """The image of frame t in the greys of the palette."""
-        image = read_image(self._path(t), *self.size)
+    def _grey(self, t: int) -> UInt8[np.ndarray, "height width"] | None:
+        """The image of frame t in the greys of the palette; None if there is none, or it cannot be read."""
+        if not self.has_images or self.content.image_paths is None:
+            return None
+        try:
+            image = read_image(self.folder / self.content.image_paths[t], *self.size)
+        except (OSError, ValueError) as error:
+            self.unread[t] = str(error)
+            return None
         return (image.astype(np.uint16) * (_NUM_GREYS - 1) // 255).astype(np.uint8)
 
 
@@ -234,7 +231,7 @@ def _plain_axes(draw: Any, size: tuple[int, int], scale: float) -> None:
 
     font, light, grey = ImageFont.load_default(size=10), int(0.93 * _WHITE), int(0.5 * _WHITE)
     step = 10 ** np.floor(np.log10(max(size) / 2)) if max(size) >= 20 else 1
-    width, height = size[0] * scale, size[1] * scale
+    width, height = (max(1.0, side * scale) for side in size)
     draw.rectangle((0, _LEGEND_PX, width - 1, _LEGEND_PX + height - 1), outline=grey)
     for u in np.arange(step, size[0], step):
         draw.line((u * scale, _LEGEND_PX + 1, u * scale, _LEGEND_PX + height - 2), fill=light)

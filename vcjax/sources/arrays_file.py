@@ -76,7 +76,8 @@ def read_arrays(path: str | os.PathLike, kinds: Mapping[str, str], max_bytes: in
             if needed > max_bytes:
                 raise ValueError(
                     f"{path}: its arrays need {needed / 2**20:.0f} MiB of memory, more than the "
-                    f"{max_bytes / 2**20:.0f} MiB allowed; raise max_bytes if you trust the file."
+                    f"{max_bytes / 2**20:.0f} MiB allowed; keep less in a file, or read it in Python with a "
+                    "larger max_bytes."
                 )
             return {name: _read(archive, name, header) for name, header in headers.items()}
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:

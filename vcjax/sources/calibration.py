@@ -36,6 +36,8 @@ NUM_COEFFICIENTS: dict[str, tuple[int, ...]] = {
     "wide_angle": (1,),
 }
 
+MAX_SIDE_PX = 2**15
+"""Largest width or height of an image, px."""
 _MAX_FILE_BYTES = 2**20
 
 
@@ -65,8 +67,8 @@ class Calibration:
     def __post_init__(self):
         for name in ("width", "height"):
             value = getattr(self, name)
-            is_size = isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 2**15
-            _require(self, name, is_size, "give a whole number of pixels from 1 to 32768.")
+            is_size = isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MAX_SIDE_PX
+            _require(self, name, is_size, f"give a whole number of pixels from 1 to {MAX_SIDE_PX}.")
         for name in ("fx", "fy", "cx", "cy"):
             _require(self, name, _is_number(getattr(self, name)), "give a finite number of pixels.")
         for name in ("fx", "fy"):

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vcjax import extras
-from vcjax.recording import Truth
+from vcjax.recording import AnyArray, Truth
 from vcjax.sources.calibration import Calibration
 from vcjax.sources.front_end import FrontEnd, track_images
 from vcjax.sources.odometry import Odometry, unknown_motion
@@ -216,6 +216,20 @@ def interpolated(
         found[is_known, axis] = np.interp(at, known, poses[:, axis])
     turns = Slerp(known, Rotation.from_quat(poses[:, 3:], scalar_first=True))(at)
     found[is_known, 3:] = turns.as_quat(scalar_first=True)
+    return found
+
+
+def camera_of_robot(T_w_r: Float[AnyArray, "T 7"], T_r_s: Float[AnyArray, "T 7"]) -> Float[np.ndarray, "T 7"]:
+    """Poses of the camera from those of its robot, T_w_c = T_w_r T_r_s; NaN stays NaN."""
+    from scipy.spatial.transform import Rotation
+
+    T_w_r, T_r_s = np.array(T_w_r, np.float64), np.array(T_r_s, np.float64)
+    is_known, found = np.isfinite(T_w_r).all(axis=1), np.full(T_w_r.shape, np.nan)
+    if np.any(is_known):
+        robot = Rotation.from_quat(T_w_r[is_known, 3:], scalar_first=True)
+        turn = robot * Rotation.from_quat(T_r_s[is_known, 3:], scalar_first=True)
+        found[is_known, :3] = T_w_r[is_known, :3] + robot.apply(T_r_s[is_known, :3])
+        found[is_known, 3:] = turn.as_quat(scalar_first=True)
     return found
 
 

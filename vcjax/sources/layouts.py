@@ -4,6 +4,8 @@ Each reader gives an `ImageSequence`. Names in the files are taken only if they 
 """
 
 import os
+import re
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +121,7 @@ def kitti_odometry(folder: str | os.PathLike, camera: int = 0, poses: str | os.P
 def plain_folder(
     folder: str | os.PathLike, calibration: Calibration | None = None, rate_hz: float | None = None
 ) -> ImageSequence:
-    """Images in a folder, in the order of their names, with what lies beside them.
+    """Images in a folder, in the order of the numbers in their names, with what lies beside them.
 
     Args:
         folder: the images lie in it or in its folder `images`; beside them may lie `calibration.json` (see
@@ -159,10 +161,17 @@ def _folder(folder: str | os.PathLike) -> Path:
 
 
 def _images(folder: Path) -> list[Path]:
-    paths = sorted(path for path in _folder(folder).iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
+    found = (path for path in _folder(folder).iterdir() if not path.name.startswith("."))
+    paths = sorted((path for path in found if path.suffix.lower() in IMAGE_ENDINGS), key=_by_numbers)
     if not paths:
         raise FileNotFoundError(f"{folder}: no image in it ({', '.join(IMAGE_ENDINGS)}).")
     return paths
+
+
+def _by_numbers(path: Path) -> tuple[list[str | Decimal], str]:
+    """The key of a name whose numbers, whole or with decimals, count as numbers: 2 before 10, and 1.175 before 1.5."""
+    parts = re.split(r"(\d+(?:\.\d+)?)", path.stem)
+    return [Decimal(part) if i % 2 else part for i, part in enumerate(parts)], path.name
 
 
 def _inside(folder: Path, name: str, place: str) -> Path:

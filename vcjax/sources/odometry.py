@@ -205,6 +205,13 @@ def dead_reckoning(recording: Recording) -> Float[np.ndarray, "T 7"]:
     return np.array(poses)
 
 
+def commanded_mounts(recording: Recording) -> Float[np.ndarray, "T 7"]:
+    """Pose T_r_s of the camera in the robot in each frame, as it was commanded."""
+    mounts = np.tile(np.asarray(recording.sensor_start, np.float64), (recording.num_frames, 1))
+    mounts[:, :3] += np.cumsum(np.asarray(recording.sensor_shift_m, np.float64), axis=0)
+    return mounts
+
+
 def _along_screw(turn: Vector, way: Vector) -> Vector:
     """V(θ) p: where the constant motion p (m) ends when the frame turns by θ (rad) on the way."""
     angle = np.linalg.norm(turn, axis=1, keepdims=True)

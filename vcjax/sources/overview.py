@@ -66,7 +66,8 @@ def summary(content: Recording | RecordingFile) -> str:
 def draw_overview(content: Recording | RecordingFile) -> Any:
     """A recording in a picture: features per frame, lengths of tracks, where in the image they are, and the path.
 
-    The path, from above, is that of the odometry alone, beside the true one where it is known.
+    Places in the image are those of the image as it was taken, where its calibration is known. The path, from above, is
+    that of the odometry alone, if there is any, beside the true one where it is known.
 
     Returns:
         A figure of matplotlib, to be shown or saved.
@@ -80,8 +81,8 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("Pictures need matplotlib: pip install 'vcjax[study]'.") from error
 
-    recording, truth, labels, _, _ = _content(content)
-    tracks = tracks_of(recording)
+    recording, truth, labels, _, calibration = _content(content)
+    tracks = tracks_of(recording, calibration)
     ids, first, length = np.unique(tracks.track_id, return_index=True, return_counts=True)
     time_s = np.asarray(recording.time_s) - float(recording.time_s[0])
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
@@ -89,17 +90,18 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     (seen, lengths), (image, path) = figure.subplots(2, 2)
 
     seen.plot(time_s, np.sum(np.asarray(recording.is_valid), axis=1), color=_BLUE)
-    if len(repeated := repeated_frames(tracks)):
+    if len(repeated := repeated_frames(tracks_of(recording))):
         seen.plot(time_s[repeated], np.zeros(len(repeated)), "|", color=_RED, markersize=12)
     marked = f"; {len(repeated)} repeat (marked)" if len(repeated) else ""
     seen.set(xlabel="time (s)", ylabel="features seen", title=f"Features in each frame{marked}", ylim=(0, None))
     if len(length):
-        bins = np.unique(np.rint(np.geomspace(1, length.max() + 1, 30))) - 0.5  # whole numbers in each
-        lengths.hist(length, bins, color=_BLUE)
+        begin = np.unique(np.rint(np.geomspace(1, length.max() + 1, 30)))  # the first whole number in each bar
+        lengths.hist(length, np.sqrt(begin * (begin - 1 + (begin == 1) / 2)), color=_BLUE)
         lengths.set_xscale("log")
     lengths.set(xlabel="length (frames)", ylabel="tracks", title=f"{len(ids)} tracks")
 
-    width, height = np.asarray(recording.camera.image_size_px)
+    size = np.asarray(recording.camera.image_size_px)
+    width, height = size if calibration is None else (calibration.width, calibration.height)
     moving = np.zeros(0, int) if labels is None else labels.track_id[labels.label == TrackLabel.MOVING]
     is_moving = np.isin(ids, moving)
     for chosen, colour, name in ((~is_moving, _GREY, "tracks"), (is_moving, _RED, "labelled moving")):
@@ -111,12 +113,17 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
         # Below: wherever it is put inside, it hides tracks.
         image.legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), borderaxespad=4.5, ncols=2, fontsize=8, frameon=False)
 
-    path.plot(*dead_reckoning(recording)[:, :2].T, color=_GREY, label="odometry alone")
+    has_odometry = bool(np.any(np.asarray(recording.odometry)))
+    if has_odometry:
+        path.plot(*dead_reckoning(recording)[:, :2].T, color=_GREY, label="odometry alone")
     if truth is not None:
         path.plot(*np.asarray(truth.robot)[:, :2].T, color=_BLUE, linestyle="--", label="truth")
     path.set(xlabel="x (m)", ylabel="y (m)", title="Path from above")
     path.axis("equal")
-    path.legend(loc="best", fontsize=8)
+    if has_odometry or truth is not None:
+        path.legend(loc="best", fontsize=8)
+    else:
+        path.text(0.5, 0.5, "neither odometry nor truth", transform=path.transAxes, ha="center", color=_GREY)
     return figure
 
 

@@ -32,7 +32,7 @@ from vcjax.fields import require_kind
 from vcjax.models.camera import Camera
 from vcjax.recording import Recording, Truth, validate
 from vcjax.sources.arrays_file import MAX_BYTES, read_arrays, write_arrays
-from vcjax.sources.calibration import Calibration
+from vcjax.sources.calibration import MAX_SIDE_PX, Calibration
 
 SCHEMA = 1
 """Version of the layout, raised when an older reader would misread it."""
@@ -174,7 +174,11 @@ def _check(path: str, content: RecordingFile) -> None:
         validate(recording)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    num_frames = recording.num_frames
+    num_frames, size = recording.num_frames, np.asarray(recording.camera.image_size_px)
+    if not np.all((size >= 1) & (size <= MAX_SIDE_PX)):
+        raise ValueError(
+            f"{path}: Camera(image_size_px={size.tolist()}): give a width and height of 1 to {MAX_SIDE_PX} px."
+        )
     if truth is not None:
         num_features = np.shape(truth.is_moving)[0] if np.ndim(truth.is_moving) == 1 else "F"
         shapes = {
@@ -186,6 +190,7 @@ def _check(path: str, content: RecordingFile) -> None:
         for name, shape in shapes.items():
             if (found := np.shape(getattr(truth, name))) != shape:
                 raise ValueError(f"{path}: Truth({name}) has shape {found}, but {shape} is needed.")
+        _check_truth(path, truth)
     if labels is not None:
         ids, label = np.asarray(labels.track_id), np.asarray(labels.label)
         if ids.ndim != 1 or ids.shape != label.shape:
@@ -193,7 +198,26 @@ def _check(path: str, content: RecordingFile) -> None:
         if len(bad := np.flatnonzero(~np.isin(label, list(TrackLabel)))):
             known = ", ".join(f"{x:d} {x.name}" for x in TrackLabel)
             raise ValueError(f"{path}: label[{bad[0]}] = {label[bad[0]]}; give one of {known}.")
+        if len(bad := np.flatnonzero((ids < 0) | (ids > np.iinfo(np.int32).max))):
+            raise ValueError(f"{path}: label_track_id[{bad[0]}] = {ids[bad[0]]}; ids start at 0 and end before 2³¹.")
         if len(np.unique(ids)) != len(ids):
             raise ValueError(f"{path}: label_track_id names a track twice; give each one label.")
     if image_paths is not None and len(image_paths) != num_frames:
         raise ValueError(f"{path}: {len(image_paths)} images for {num_frames} frames; give one for each.")
+
+
+def _check_truth(path: str, truth: Truth) -> None:
+    """Refuse what no truth is: poses are finite or NaN, with quaternions of unit length; features are finite."""
+    for name in ("robot", "sensor", "landmarks_m"):
+        values, may_be_nan = np.asarray(getattr(truth, name), np.float64), name != "landmarks_m"
+        if len(bad := np.argwhere(np.isinf(values) if may_be_nan else ~np.isfinite(values))):
+            place = bad[0].tolist()
+            remedy = "give a finite number" + (", or NaN where nobody knows." if may_be_nan else ".")
+            raise ValueError(f"{path}: Truth({name}{place} = {values[tuple(place)]}): {remedy}")
+    for name in ("robot", "sensor"):
+        length = np.linalg.norm(np.asarray(getattr(truth, name), np.float64)[:, 3:], axis=1)
+        if len(bad := np.flatnonzero(np.abs(length - 1.0) > 1e-3)):  # false of NaN
+            t = bad[0]
+            raise ValueError(
+                f"{path}: Truth({name}[{t}]): the quaternion has length {length[t]:.4g}; divide it by its length."
+            )

@@ -92,17 +92,6 @@ def surfaces_of(
     return tuple(surfaces)
 
 
-def camera_poses(truth: Truth) -> Float[np.ndarray, "T 7"]:
-    """Pose T_w_c of the camera in each frame: T_w_r T_r_s."""
-    from scipy.spatial.transform import Rotation
-
-    robot, sensor = np.array(truth.robot, np.float64), np.array(truth.sensor, np.float64)
-    turn = Rotation.from_quat(robot[:, 3:], scalar_first=True)
-    place = robot[:, :3] + turn.apply(sensor[:, :3])
-    whole = turn * Rotation.from_quat(sensor[:, 3:], scalar_first=True)
-    return np.column_stack([place, whole.as_quat(scalar_first=True)])
-
-
 def render(
     surfaces: Sequence[Surface],
     calibration: Calibration,

@@ -17,10 +17,10 @@ from vcjax.recording import Recording, Truth
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import simulate
 from vcjax.sources.calibration import Calibration, write_calibration
-from vcjax.sources.image_sequence import ImageSequence
+from vcjax.sources.image_sequence import ImageSequence, camera_of_robot
 from vcjax.sources.layouts import plain_folder
 from vcjax.sources.odometry import Odometry, write_odometry
-from vcjax.sources.render import Surface, camera_poses, render, surfaces_of
+from vcjax.sources.render import Surface, render, surfaces_of
 from vcjax.sources.rendered_truth import Followed, what_tracks_follow
 from vcjax.sources.table_file import write_table
 from vcjax.sources.tracks import Tracks
@@ -42,7 +42,7 @@ class RenderedSequence(NamedTuple):
 
     def followed(self, tracks: Tracks) -> Followed:
         """What tracks in the images follow, and how exactly; see `rendered_truth.py`."""
-        calibration, poses = self.sequence.calibration, camera_poses(self.truth)
+        calibration, poses = self.sequence.calibration, camera_of_robot(self.truth.robot, self.truth.sensor)
         return what_tracks_follow(tracks, self.surfaces, calibration, poses, self.sequence.time_s)
 
 
@@ -88,7 +88,7 @@ def render_sequence(
                         for tree in (recording, truth))  # fmt: skip
     calibration = Calibration.from_camera(scenario.camera, recording.sensor_start)
     surfaces = surfaces_of(scenario, truth, patch_m, room_margin_m, seed)
-    poses = camera_poses(truth)
+    poses = camera_of_robot(truth.robot, truth.sensor)
     import cv2
 
     for t, (pose, time_s) in enumerate(zip(poses, recording.time_s, strict=True)):

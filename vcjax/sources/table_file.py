@@ -5,6 +5,7 @@ The rows of a Parquet file are counted from 1. Columns that are not asked for ar
 """
 
 import csv
+import mmap
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -122,21 +123,32 @@ def _read_csv(path: Path, kinds: Mapping[str, Kind], optional: Sequence[str]) ->
     found = _choose(path, names, kinds, optional)
     if not line.endswith(b"\n"):
         return {name: np.zeros(0, np.int64 if kinds[name] == "whole" else np.float64) for name in found}
-    types = {"whole": arrow.int64(), "real": arrow.float64()}
-    try:
-        table = arrow_csv.read_csv(
+
+    def read(types: Mapping[str, Any]) -> Any:
+        return arrow_csv.read_csv(
             path,
             # One thread: only so Arrow counts lines. Columns that are not asked for may lack a name.
             arrow_csv.ReadOptions(
                 use_threads=False, skip_rows=1, column_names=[name or f"\0{i}" for i, name in enumerate(names)]
             ),
             arrow_csv.ParseOptions(ignore_empty_lines=False),
-            arrow_csv.ConvertOptions(
-                include_columns=found, column_types={name: types[kinds[name]] for name in found}, null_values=[]
-            ),
+            arrow_csv.ConvertOptions(include_columns=[*types], column_types=types, null_values=[]),
         )
+
+    types = {"whole": arrow.int64(), "real": arrow.float64()}
+    try:
+        table = read({name: types[kinds[name]] for name in found})
     except arrow.ArrowInvalid as error:
         raise ValueError(_csv_refusal(path, str(error), names, kinds)) from error
+    # Arrow takes 0x10 for a whole number, 16; so does nobody else.
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        may_be_hexadecimal = max(content.find(b"0x"), content.find(b"0X")) >= 0
+    if may_be_hexadecimal and (whole := [name for name in found if kinds[name] == "whole"]):
+        texts = read(dict.fromkeys(whole, arrow.string()))
+        for name in whole:
+            for row, text in enumerate(texts[name].to_pylist()):
+                if "x" in text.lower():
+                    raise ValueError(f"{path}, line {row + 2}, column {name}: {text[:40]!r} is not {_WANTED['whole']}.")
     return {name: table[name].to_numpy() for name in found}
 
 
@@ -148,6 +160,10 @@ def _csv_refusal(path: Path, message: str, names: list[str], kinds: Mapping[str,
         return f"{path}, line {line}, column {column}: {shown} is not {_WANTED[kinds[column]]}."
     if found := re.search(r"Row #(\d+): Expected (\d+) columns, got (\d+)", message):
         return f"{path}, line {found[1]}: {found[3]} cells, but the header names {found[2]} columns."
+    if "newlines_in_values" in message:
+        with path.open("rb") as file:
+            open_quote = next((n for n, line in enumerate(file, 1) if line.count(b'"') % 2), None)
+        return f"{path}, line {open_quote}: a quote that is not closed in the same line."
     return f"{path}: {_first_line(message)}"
 
 

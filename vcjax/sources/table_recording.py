@@ -12,6 +12,7 @@ import numpy as np
 from vcjax.recording import Truth
 from vcjax.sources.calibration import read_calibration
 from vcjax.sources.image_sequence import PoseTruth, interpolated, robot_of_camera
+from vcjax.sources.odometry import commanded_mounts
 from vcjax.sources.recording_file import RecordingFile, TrackLabel, TrackLabels
 from vcjax.sources.table_file import read_table, write_table
 from vcjax.sources.tracks import read_recording
@@ -81,8 +82,7 @@ def record_tables(
         poses = interpolated(PoseTruth(time_s, poses, of="robot"), frame_time_s)
     elif len(poses) != len(frame_time_s):
         raise ValueError(f"{truth_file}: {len(poses)} poses without times for {len(frame_time_s)} frames.")
-    mounts = np.tile(np.asarray(recording.sensor_start, np.float64), (len(frame_time_s), 1))
-    mounts[:, :3] += np.cumsum(np.asarray(recording.sensor_shift_m, np.float64), axis=0)
+    mounts = commanded_mounts(recording)
     if truth_of_camera:
         poses = robot_of_camera(poses, mounts)
     truth = Truth(poses, mounts, np.zeros((len(poses), 0, 3)), np.zeros(0, bool))

@@ -107,7 +107,7 @@ def recording_from_tracks(
     """A recording of T frames from tracks in them.
 
     Pixels are straightened into those of the pin-hole camera (see `distortion.py`); where the lens has no inverse they
-    are left out.
+    are not valid, and NaN.
 
     Args:
         tracks: sightings, at most one of a track in a frame.
@@ -126,9 +126,8 @@ def recording_from_tracks(
         bad = frame[(frame < 0) | (frame >= num_frames)][0]
         raise ValueError(f"recording_from_tracks(tracks): frame {bad}, but there are {num_frames} frames, from 0.")
     uv_px = straighten(calibration, tracks.uv_px)
-    kept = np.flatnonzero(np.isfinite(uv_px[:, 0]))
-    kept = kept[np.lexsort((track_id[kept], frame[kept]))]
-    frame, track_id, uv_px = frame[kept], track_id[kept], uv_px[kept]
+    order = np.lexsort((track_id, frame))
+    frame, track_id, uv_px = frame[order], track_id[order], uv_px[order]
 
     per_frame = np.bincount(frame, minlength=num_frames)
     num_columns = max(1, int(per_frame.max()))
@@ -140,7 +139,8 @@ def recording_from_tracks(
     column = np.arange(len(frame)) - np.repeat(np.cumsum(per_frame) - per_frame, per_frame)
     shape = (num_frames, num_columns)
     ids, pixels, is_valid = np.zeros(shape, np.int64), np.zeros((*shape, 2)), np.zeros(shape, bool)
-    ids[frame, column], pixels[frame, column], is_valid[frame, column] = track_id, uv_px, True
+    ids[frame, column], pixels[frame, column] = track_id, uv_px
+    is_valid[frame, column] = np.isfinite(uv_px[:, 0])
     recording = Recording(
         time_s=np.asarray(time_s, np.float64),
         odometry=odometry.increment,

@@ -1,4 +1,4 @@
-"""What whoever runs a filter over a recording should know of it first: frames that repeat, jumps in time, blind frames.
+"""What whoever runs a filter over a recording should know of it first: repeats, jumps, blind frames, wrong lenses.
 
 None of it breaks a run. It tells where the estimate is weak, or where the front end rather than the filter is at fault.
 """
@@ -12,6 +12,7 @@ from vcjax.sources.tracks import tracks_of
 
 JUMP = 1.5
 """A time step this many times the median, or more, is a jump: at least one frame in between was dropped."""
+NO_ODOMETRY = "no odometry: run with --motion constant_velocity; the scale is free unless a length is known"
 _MOST_NAMED = 5
 
 
@@ -39,6 +40,18 @@ def unfollowed_frames(recording: Recording) -> Int[np.ndarray, " U"]:
     return np.array(found, int)
 
 
+def outside_image(recording: Recording) -> int:
+    """How many sightings are more than a pixel outside the image."""
+    uv_px = np.asarray(recording.uv_px)[np.asarray(recording.is_valid)]
+    return int(np.sum(np.any((uv_px < -1.0) | (uv_px > np.asarray(recording.camera.image_size_px) + 1.0), axis=1)))
+
+
+def without_ray(recording: Recording) -> int:
+    """How many sightings are not valid because the lens has no inverse there (see `recording_from_tracks`)."""
+    is_nowhere = np.isnan(np.asarray(recording.uv_px)).any(axis=-1)
+    return int(np.sum(is_nowhere & ~np.asarray(recording.is_valid)))
+
+
 def warnings(recording: Recording) -> list[str]:
     """A line for each thing to be warned of."""
     found = []
@@ -55,8 +68,16 @@ def warnings(recording: Recording) -> list[str]:
         found.append(f"{_frames(empty)}: no feature is seen")
     if len(unfollowed := unfollowed_frames(recording)):
         found.append(f"{_frames(unfollowed)}: no track goes on from the frame before")
+    if num := outside_image(recording):
+        width, height = np.asarray(recording.camera.image_size_px)
+        found.append(
+            f"{num} sightings of {np.sum(recording.is_valid)} lie outside the image ({width:g} × {height:g} px): is "
+            "this the calibration of these images?"
+        )
+    if num := without_ray(recording):
+        found.append(f"{num} sightings are left out, as the lens of the calibration has no place for their pixels")
     if not np.any(np.asarray(recording.odometry)):
-        found.append("no odometry: run with --motion constant_velocity; the scale is free unless a length is known")
+        found.append(NO_ODOMETRY)
     return found
 
 
