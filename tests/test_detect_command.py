@@ -49,7 +49,9 @@ def test_detect_writes_its_scores_and_goes_on_where_it_stopped(tmp_path, capsys,
     assert len(content["cells"]) == 8 and len(content["static_cells"]) == 12
     for cell in content["cells"]:
         assert cell["dynamic_motion"] == "lateral" and cell["runs"] == 3 and cell["runs_failed"] == 0
-        for name in ("found_fraction", "static_flagged_fraction", "delay_frames", "anees_position"):
+        for name in ("static_flagged_fraction", "delay_frames", "anees_position"):
+            assert set(cell[name]) == {"mean", "se"}
+        for name in ("found_fraction", "found_of_mapped_fraction", "found_per_run"):
             assert set(cell[name]) == {"mean", "se"}
         difference = cell["difference"]["position_rmse_cm"]
         expected = cell["position_rmse_cm"]["mean"] - cell["static_scene_position_rmse_cm"]["mean"]

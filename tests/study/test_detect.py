@@ -44,7 +44,7 @@ def invented(seed: int = 0) -> xr.Dataset:
 def test_scores_equal_python_loops():
     runs, static = invented(1), invented(2)
     found, movers, false, mapped, delays = ([] for _ in range(5))
-    velocity_errors, nees = [], []
+    velocity_errors, nees, ever_mapped = [], [], 0
     for s in range(NUM_SEEDS):
         if s == 2:
             continue
@@ -55,6 +55,7 @@ def test_scores_equal_python_loops():
             if bool(runs.is_moving[f]):
                 counts["movers"] += flagged or int(one.frames_mapped) >= 20
                 counts["found"] += flagged
+                ever_mapped += int(one.frames_mapped) > 0
                 if int(one.inconsistent_deletions) > 0:
                     velocity_errors.append(float(one.velocity_error_m_s))
                     nees.append(float(one.velocity_nees) / 3)
@@ -69,6 +70,10 @@ def test_scores_equal_python_loops():
     score = scores(runs, static)
     assert 0 < sum(found) < sum(movers) < 6 * (NUM_SEEDS - 1) and 0 < sum(false) < sum(mapped)
     assert (score["movers_found"], score["movers"]) == (sum(found), sum(movers))
+    assert score["movers_mapped"] == ever_mapped > score["movers"]
+    assert score["found_of_mapped_fraction"]["mean"] == pytest.approx(sum(found) / ever_mapped)
+    per_run = [np.mean(found), np.std(found, ddof=1) / np.sqrt(len(found))]
+    assert list(score["found_per_run"].values()) == pytest.approx(per_run)
     assert (score["static_flagged"], score["static_mapped"]) == (sum(false), sum(mapped))
     assert (score["runs"], score["runs_failed"]) == (NUM_SEEDS, 1)
     assert score["found_fraction"]["mean"] == pytest.approx(sum(found) / sum(movers))

@@ -34,7 +34,7 @@ from vcjax.study.summary import mean_and_error, per_run
 from vcjax.study.sweep import Experiment
 
 MIN_FRAMES_MAPPED = 20
-"""A mover counts if it was in the map for so many frames, or was flagged."""
+"""In `found_fraction` a mover counts if it was in the map for so many frames, or was flagged."""
 
 
 def _with(gate: AbstractGate, detector: AbstractDetector) -> FilterConfig:
@@ -149,12 +149,14 @@ def scores(runs: xr.Dataset, static: xr.Dataset) -> dict[str, Any]:
         static: runs of the scene without movers, of the same seeds.
 
     Returns: with `mean` and `se`: `found_fraction`, unique movers flagged of those in the map for at least
-        `MIN_FRAMES_MAPPED` frames or flagged; `static_flagged_fraction`, static features ever flagged of those ever
-        mapped; `delay_frames`, from first birth to first deletion of the movers found; `position_rmse_cm`,
-        `orientation_error_deg` and `anees_position` of a run; `velocity_error_m_s` and `velocity_nees` (over 3) of the
-        movers whose velocity was known when they were flagged; and `position_ratio`, position error against the static
-        scene's over the seeds finite in both. Counts: `movers`, `movers_found`, `static_mapped`, `static_flagged`,
-        `runs`, `runs_failed` and `runs_map_full`. Failed runs are left out. NaN where there is nothing to count.
+        `MIN_FRAMES_MAPPED` frames or flagged, which flatters: one that was mapped for less counts if it was found and
+        not if it was missed; `found_of_mapped_fraction`, of all movers ever mapped, and `found_per_run`, unique movers
+        flagged in a run; `static_flagged_fraction`, static features ever flagged of those ever mapped; `delay_frames`,
+        from first birth to first deletion of the movers found; `position_rmse_cm`, `orientation_error_deg` and
+        `anees_position` of a run; `velocity_error_m_s` and `velocity_nees` (over 3) of the movers whose velocity was
+        known when they were flagged; and `position_ratio`, position error against the static scene's over the seeds
+        finite in both. Counts: `movers`, `movers_mapped`, `movers_found`, `static_mapped`, `static_flagged`, `runs`,
+        `runs_failed` and `runs_map_full`. Failed runs are left out. NaN where there is nothing to count.
 
     References: Cochran 1977, *Sampling Techniques*, section 2.11, for the standard error of a ratio.
     """
@@ -162,18 +164,20 @@ def scores(runs: xr.Dataset, static: xr.Dataset) -> dict[str, Any]:
     is_finite = runs.is_finite.values.astype(bool)
     is_moving, frames = runs.is_moving.values, runs.frames_mapped.values[is_finite]
     is_flagged = (runs.dynamic_deletions + runs.inconsistent_deletions).values[is_finite] > 0
-    is_mover, is_static = is_moving & (is_flagged | (frames >= MIN_FRAMES_MAPPED)), ~is_moving & (frames > 0)
-    is_found, is_false = is_mover & is_flagged, is_static & is_flagged
+    is_found, is_static = is_moving & is_flagged, ~is_moving & (frames > 0)
     velocity = {name: runs[name].values[is_finite] for name in ("velocity_error_m_s", "velocity_nees")}
     is_known = is_found & ~np.isnan(velocity["velocity_error_m_s"])
     error, nees = (np.where(is_known, each, 0).sum(axis=1) for each in velocity.values())
     delay = np.where(is_found, (runs.first_deleted - runs.first_mapped).values[is_finite], 0)
-    found, movers = is_found.sum(axis=1), is_mover.sum(axis=1)
-    false, mapped = is_false.sum(axis=1), is_static.sum(axis=1)
+    found, movers_mapped = is_found.sum(axis=1), (is_moving & (frames > 0)).sum(axis=1)
+    movers = (is_found | is_moving & (frames >= MIN_FRAMES_MAPPED)).sum(axis=1)
+    false, mapped = (is_static & is_flagged).sum(axis=1), is_static.sum(axis=1)
     both = (runs.is_finite & static.is_finite).values
     rmse = [each.position_rmse_cm.values[both] for each in (figures, static_figures)]
     return {
         "found_fraction": pooled(found, movers),
+        "found_of_mapped_fraction": pooled(found, movers_mapped),
+        "found_per_run": pooled(found, np.ones(len(found))),
         "static_flagged_fraction": pooled(false, mapped),
         "delay_frames": pooled(delay.sum(axis=1), found),
         "velocity_error_m_s": pooled(error, is_known.sum(axis=1)),
@@ -181,6 +185,7 @@ def scores(runs: xr.Dataset, static: xr.Dataset) -> dict[str, Any]:
         **{name: _mean(figures[name]) for name in ("position_rmse_cm", "orientation_error_deg", "anees_position")},
         "position_ratio": pooled(*rmse),
         "movers": int(movers.sum()),
+        "movers_mapped": int(movers_mapped.sum()),
         "movers_found": int(found.sum()),
         "static_mapped": int(mapped.sum()),
         "static_flagged": int(false.sum()),
