@@ -7,8 +7,11 @@ import xarray as xr
 from fake_runs import fake_runs
 
 from vcjax.study import reproduce
-from vcjax.study.detect import METHODS, detect, pooled, scores
+from vcjax.study.detect import detect
+from vcjax.study.detection_methods import METHODS
 from vcjax.study.detection_scenes import Scene
+from vcjax.study.detection_scores import Counts, counts, pooled, scores
+from vcjax.study.operating_curves import operating_point
 from vcjax.study.paper import Cell
 from vcjax.study.results import attributes
 from vcjax.study.sweep import Experiment
@@ -129,7 +132,8 @@ def test_scenes_are_the_six_with_movers_and_the_three_without(tmp_path, monkeypa
         return runs.assign_attrs(attributes(Experiment(scenario, config), key))
 
     monkeypatch.setattr(reproduce, "monte_carlo", monte_carlo)
-    runs = detect(tmp_path, ["RE+velocity_glr", "VC"], num_seeds=26, key=jax.random.key(0))
+    runs, curves = detect(tmp_path, ["RE+velocity_glr", "VC"], num_seeds=26, key=jax.random.key(0))
+    assert curves == {}
     assert len(runs) == 2 * 3 * 9 and len(worked) == 2 * len(runs)
     assert [(first, num) for _, _, first, num in worked[:2]] == [(0, 25), (25, 1)]
     assert all(found.seed.values.tolist() == list(range(26)) for found in runs.values())
@@ -147,7 +151,7 @@ def test_scenes_are_the_six_with_movers_and_the_three_without(tmp_path, monkeypa
     detect(tmp_path, ["VC"], num_seeds=30, key=jax.random.key(0))
     assert {(first, num) for _, _, first, num in worked} == {(25, 5)} and len(worked) == 27
     worked.clear()
-    fewer = detect(tmp_path, ["VC"], num_seeds=2, key=jax.random.key(0))
+    fewer, _ = detect(tmp_path, ["VC"], num_seeds=2, key=jax.random.key(0))
     assert not worked and all(found.sizes["seed"] == 2 for found in fewer.values())
 
 
@@ -168,7 +172,7 @@ def test_harder_scenes_stand_beside_their_static_ones(tmp_path, monkeypatch):
 
     monkeypatch.setattr(reproduce, "monte_carlo", monte_carlo)
     options = dict(amplitudes_m=(0.1,), motions=("lateral",), speeds_m_s=(1.0,), num_seeds=1, key=jax.random.key(0))
-    runs = detect(
+    runs, _ = detect(
         tmp_path, ["VC"], dynamic_sets=("ahead", "near_path"), harder_scenes=("turns", "jitter_5_mm"), **options
     )
     scenes = [scene for _, scene in runs]
@@ -181,8 +185,64 @@ def test_harder_scenes_stand_beside_their_static_ones(tmp_path, monkeypatch):
 
 
 def test_only_methods_with_a_detector_of_their_own_flag_for_good():
-    assert {name for name, config in METHODS.items() if config.blacklist_capacity == 0} == {
+    assert {name for name, method in METHODS.items() if method.config.blacklist_capacity == 0} == {
         "VC",
         "RE",
         "one_point_ransac",
     }
+
+
+def test_every_method_has_its_own_threshold_on_its_curve_and_flags_less_along_it():
+    """Whatever its threshold is called, and without a new structure: what is traced does not compile again."""
+    scenario = Scene(0.1).scenario(12)
+    for method in METHODS.values():
+        assert method.threshold in method.curve and len(set(method.curve)) == len(method.curve) >= 5
+        own, *others = (method.experiment(scenario, value) for value in (None, *method.curve))
+        assert {jax.tree.structure(each) for each in others} == {jax.tree.structure(own)}
+        assert {leaf.shape for each in others for leaf in map(np.asarray, jax.tree.leaves(each.config))} == {()}
+        assert list(method.curve) == sorted(method.curve, reverse="false_alarm_rate" in method.leaves[0])
+
+
+def test_curves_are_of_runs_at_each_threshold_in_the_scenes_with_movers(tmp_path, monkeypatch):
+    """The method's own is not run twice, and what is there is not run again."""
+    worked = []
+
+    def monte_carlo(scenario, config, *, first_seed, num_seeds, key, **_):
+        worked.append((float(scenario.movers.speed_m_s), float(config.detector.threshold)))
+        runs = fake_runs(MOVING, num_seeds=num_seeds).assign_coords(seed=first_seed + np.arange(num_seeds))
+        return runs.assign_attrs(attributes(Experiment(scenario, config), key))
+
+    monkeypatch.setattr(reproduce, "monte_carlo", monte_carlo)
+    options = dict(amplitudes_m=(0.1,), motions=("lateral",), speeds_m_s=(1.0, 0.5), harder_scenes=("turns",))
+    options |= dict(num_seeds=3, key=jax.random.key(0))
+    name, thresholds = "RE+velocity_glr", METHODS["RE+velocity_glr"].curve
+    runs, curves = detect(tmp_path, [name], curves=True, **options)
+    assert len(runs) == 6 and list(curves) == [(name, 0.1)] and tuple(curves[name, 0.1]) == thresholds
+    assert sorted(worked[6:]) == sorted((v, th) for v in (1.0, 0.5) for th in thresholds if th != 17.0)
+    two_scenes = [2 * each for each in counts(runs[name, Scene(0.1, "lateral", 1.0)])]
+    for point in curves[name, 0.1].values():
+        np.testing.assert_array_equal(point, two_scenes)
+    worked.clear()
+    _, again = detect(tmp_path, [name], curves=True, **options)
+    assert not worked and all(map(np.array_equal, again[name, 0.1].values(), curves[name, 0.1].values()))
+
+
+def test_a_point_of_a_curve_has_the_interval_of_many_studies():
+    """Features of a seed share its luck; of a share that no seed departs from, nothing is known but itself."""
+    rng = np.random.default_rng(0)
+    movers, static = np.full((300, 40), 6), np.full((300, 40), 90)
+    found, flagged = rng.binomial(movers, rng.beta(4, 2, size=movers.shape)), rng.binomial(static, 0.02)
+    points = [operating_point(Counts(*each)) for each in zip(found, movers, flagged, static, strict=True)]
+    for name, truth in (("found_of_mapped_fraction", 2 / 3), ("static_flagged_fraction", 0.02), ("precision", 4 / 5.8)):
+        covered = [point[name]["lower"] <= truth <= point[name]["upper"] for point in points]
+        assert 0.88 < np.mean(covered) < 0.99, name
+    assert points[0]["found"] == found[0].sum() and points[0]["static"] == 40 * 90
+    assert points[0]["precision"]["mean"] == pytest.approx(found[0].sum() / (found[0] + flagged[0]).sum())
+    never = operating_point(Counts(np.zeros(4), np.full(4, 6), np.zeros(4), np.full(4, 90)))
+    assert never["found_of_mapped_fraction"] == {"mean": 0.0, "lower": 0.0, "upper": 0.0}
+    assert np.isnan(list(never["precision"].values())).all()
+
+
+def test_counts_leave_failed_runs_out():
+    count = counts(invented(1))
+    assert [each[2] for each in count] == [0] * 4 and all((each[[0, 1]] > 0).all() for each in count)

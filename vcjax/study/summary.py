@@ -82,8 +82,9 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
     `dynamic_found_per_run` and `static_deleted_per_run` count distinct moving and static features deleted at least
     once. With them, and with as many movers as were measured candidates or deleted, `detection_f1` is
     2 found / (found + static deleted + movers), NaN where nothing moves; `detection_auc` is the area under the ROC of
-    the features' `roc.track_scores`, NaN where no mover was measured, or nothing else. `detection_delay_frames` is the
-    mean over the movers found of the frames from first birth to first deletion.
+    the features' `roc.track_scores`, which says little of other thresholds where what is deleted never comes back, NaN
+    where no mover was measured, or nothing else. `detection_delay_frames` is the mean over the movers found of the
+    frames from first birth to first deletion.
 
     ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter; frames where it is not
     defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `nis` is the mean squared
