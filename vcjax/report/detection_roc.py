@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vcjax.report.markup import grid
-from vcjax.report.style import METHOD_COLOURS, RC, new_figure
+from vcjax.report.style import METHOD_STYLES, RC, new_figure
 from vcjax.study.operating_curves import Curves, operating_point
 
 _INTRODUCTION = """\
@@ -79,18 +79,15 @@ def precision_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
 
 def _panels(table: Sequence[Mapping[str, Any]], across: str, up: str) -> tuple[Figure, list[Axes]]:
     """One figure over another: points joined in the order of the thresholds, 95 % bands upward and whiskers across."""
-    amplitudes, methods = (list(dict.fromkeys(line[name] for line in table)) for name in ("amplitude_m", "detector"))
+    amplitudes = list(dict.fromkeys(line["amplitude_m"] for line in table))
     figure = new_figure(2.9 * len(amplitudes) + 0.6, 3.9)
     panels = list(figure.subplots(1, len(amplitudes), squeeze=False, sharey=True).flat)
     for axes, amplitude in zip(panels, amplitudes, strict=True):
         for line in (line for line in table if line["amplitude_m"] == amplitude):
             x, y = (_values(line, name) for name in (across, up))
-            colour = METHOD_COLOURS[methods.index(line["detector"])]
-            axes.fill_between(x[0], y[1], y[2], color=colour, alpha=0.18, linewidth=0)
-            whiskers = np.abs(x[1:] - x[0])
-            axes.errorbar(
-                x[0], y[0], xerr=whiskers, color=colour, marker="o", markersize=3, linewidth=1.2, label=line["detector"]
-            )
+            style = METHOD_STYLES[line["detector"]] | {"markersize": 4, "linewidth": 1.2, "label": line["detector"]}
+            axes.fill_between(x[0], y[1], y[2], color=style["color"], alpha=0.15, linewidth=0)
+            axes.errorbar(x[0], y[0], xerr=np.abs(x[1:] - x[0]), **style)
         axes.set_ylim(0, 1.02)
         axes.set_title(_camera(line))
     handles, names = panels[0].get_legend_handles_labels()
