@@ -13,7 +13,7 @@ from vcjax.study.detection_scenes import Scene
 from vcjax.study.detection_scores import Counts, counts, pooled, scores
 from vcjax.study.operating_curves import operating_point
 from vcjax.study.paper import Cell
-from vcjax.study.results import attributes
+from vcjax.study.results import attributes, describe
 from vcjax.study.sweep import Experiment
 
 NUM_SEEDS = 7
@@ -184,7 +184,17 @@ def test_harder_scenes_stand_beside_their_static_ones(tmp_path, monkeypatch):
         detect(tmp_path, ["VC"], harder_scenes=("fog",), **options)
 
 
-def test_only_methods_with_a_detector_of_their_own_flag_for_good():
+def test_each_gate_stands_there_with_the_settings_of_the_tests_too():
+    """So that what a detector adds is told from what the blacklist and more updates add."""
+    for gate in ("VC", "RE", "one_point_ransac"):
+        plain, config = METHODS[gate].config, METHODS[f"{gate}+blacklist"].config
+        test = METHODS["RE+velocity_glr"].config
+        assert describe(config.gate) == describe(plain.gate) and describe(config.detector) == describe(plain.detector)
+        expected = describe(test) | {name: describe(config)[name] for name in ("gate", "detector")}
+        assert describe(config) == expected != describe(plain)
+
+
+def test_only_the_plain_gates_let_what_was_flagged_come_back():
     assert {name for name, method in METHODS.items() if method.config.blacklist_capacity == 0} == {
         "VC",
         "RE",

@@ -23,7 +23,7 @@ class Detect:
     seeds: int = 25
     """Runs of each method in each scene."""
     methods: tuple[str, ...] = tuple(METHODS)
-    """Which: the paper's VC and RE, and gates with a detector."""
+    """Which: the paper's VC and RE, these with a blacklist, and gates with a detector."""
     curves: bool = False
     """Run each method at other thresholds too, for ROC and precision–recall curves: about four times as many runs."""
     amplitudes_m: tuple[float, ...] = (0.0, 0.05, 0.1)

@@ -28,10 +28,13 @@ RC: Any = {
     "svg.fonttype": "path",
 }
 """Matplotlib's settings."""
-METHOD_STYLES: dict[str, dict[str, str]] = {
+METHOD_STYLES: dict[str, dict[str, Any]] = {
     "VC": {"color": "#000000", "marker": "o"},
     "RE": {"color": "#e69f00", "marker": "s"},
     "one_point_ransac": {"color": "#009e73", "marker": "D"},
+    "VC+blacklist": {"color": "#7a7a7a", "marker": "o", "linestyle": "--"},
+    "RE+blacklist": {"color": "#b87333", "marker": "s", "linestyle": "--"},
+    "one_point_ransac+blacklist": {"color": "#66c2a5", "marker": "D", "linestyle": "--"},
     "RE+velocity_glr": {"color": "#0072b2", "marker": "^"},
     "VC+velocity_glr": {"color": "#d55e00", "marker": "v"},
     "RE+velocity_likelihood_ratio": {"color": "#cc79a7", "marker": "P"},

@@ -7,6 +7,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.gates.cusum import Cusum
 from vcjax.gates.gate import AbstractDetector, AbstractGate
 from vcjax.gates.immediate import Immediate
+from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
 from vcjax.gates.velocity_glr import VelocityGLR
@@ -56,6 +57,9 @@ METHODS: Mapping[str, Method] = {
     "VC": Method(FilterConfig(gate=VirtualCorrection()), _BOTH, _GATE_CURVE),
     "RE": Method(FilterConfig(gate=ReprojectionError()), _TH1, _GATE_CURVE),
     "one_point_ransac": Method(FilterConfig(gate=OnePointRansac()), _TH1, _GATE_CURVE),
+    "VC+blacklist": Method(_with(VirtualCorrection(), InlierRatio()), _BOTH, _GATE_CURVE),
+    "RE+blacklist": Method(_with(ReprojectionError(), InlierRatio()), _TH1, _GATE_CURVE),
+    "one_point_ransac+blacklist": Method(_with(OnePointRansac(), InlierRatio()), _TH1, _GATE_CURVE),
     "RE+velocity_glr": Method(_with(ReprojectionError(), _GLR), _GLR_LEAVES, _GLR_CURVE),
     "VC+velocity_glr": Method(_with(VirtualCorrection(), _GLR), _GLR_LEAVES, _GLR_CURVE),
     "RE+velocity_likelihood_ratio": Method(
@@ -70,5 +74,5 @@ METHODS: Mapping[str, Method] = {
     "RE+immediate": Method(_with(_WIDE, Immediate()), _TH1, (6.0, 9.0, 12.0, 18.0, 28.0, 45.0)),
 }
 """What is compared, by name: one setting each for all scenes. VC and RE are the paper's, with the deletion rule of its
-toolbox, and so is the field's 1-point RANSAC; the others have the detector's own threshold, correct with more
-landmarks, and flag for good."""
+toolbox, and so is the field's 1-point RANSAC. With "+blacklist" they correct with more landmarks and flag for good, as
+the others do, which have a detector of their own."""
