@@ -62,7 +62,7 @@ def roc_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
     figure, panels = _panels(table, "static_flagged_fraction", "found_of_mapped_fraction")
     for axes in panels:
         axes.set_xscale("symlog", linthresh=_RESOLVED)
-        axes.set(xlim=(0, 1), xlabel="static features flagged")
+        axes.set(xlim=(-_RESOLVED / 10, 1), xlabel="static features flagged")
     panels[0].set_ylabel("movers found")
     return figure
 
@@ -80,7 +80,7 @@ def precision_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
 def _panels(table: Sequence[Mapping[str, Any]], across: str, up: str) -> tuple[Figure, list[Axes]]:
     """One figure over another: points joined in the order of the thresholds, 95 % bands upward and whiskers across."""
     amplitudes = list(dict.fromkeys(line["amplitude_m"] for line in table))
-    figure = new_figure(2.9 * len(amplitudes) + 0.6, 3.9)
+    figure = new_figure(max(2.9 * len(amplitudes), 4.6) + 0.6, 3.9)
     panels = list(figure.subplots(1, len(amplitudes), squeeze=False, sharey=True).flat)
     for axes, amplitude in zip(panels, amplitudes, strict=True):
         for line in (line for line in table if line["amplitude_m"] == amplitude):
@@ -91,7 +91,7 @@ def _panels(table: Sequence[Mapping[str, Any]], across: str, up: str) -> tuple[F
         axes.set_ylim(0, 1.02)
         axes.set_title(_camera(line))
     handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(names)))
+    figure.legend(handles, names, loc="outside lower center", ncols=min(3, len(names)))
     figure.suptitle("All scenes with movers, a run for each threshold, 95 % intervals", fontsize=10)
     return figure, panels
 
