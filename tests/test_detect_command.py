@@ -52,7 +52,8 @@ def test_detect_writes_its_scores_and_goes_on_where_it_stopped(tmp_path, capsys,
     assert len(content["cells"]) == 8 and len(content["static_cells"]) == 12
     for cell in content["cells"]:
         assert cell["dynamic_motion"] == "lateral" and cell["runs"] == 3 and cell["runs_failed"] == 0
-        for name in ("static_flagged_fraction", "delay_frames", "anees_position"):
+        assert list(cell["anees_bounds"]) == ["anees_position", "anees_pose", "anees_map"]
+        for name in ("static_flagged_fraction", "delay_frames", "anees_position", "anees_pose", "anees_map"):
             assert set(cell[name]) == {"mean", "se"}
         for name in ("found_fraction", "found_of_mapped_fraction", "found_per_run"):
             assert set(cell[name]) == {"mean", "se"}

@@ -1,10 +1,12 @@
 """Scripts that read what commands wrote: what they pair and compare, and what they refuse."""
 
 import importlib.util
+import json
 from pathlib import Path
 
 import pytest
-from fake_runs import fake_runs
+from fake_runs import fake_runs, with_failed_seed
+from scipy import stats
 
 from vcjax.simulation.scenarios import HARDER
 from vcjax.study.detection_scenes import Scene, scenes_of
@@ -31,6 +33,33 @@ def written(directory: Path, scene: Scene, num_seeds: int, error_cm: float) -> N
     error = runs.position_error_m * 0 + 0.01 * (error_cm + runs.seed)
     runs = runs.assign(frames_mapped=frames, position_error_m=error).assign_attrs(schema=SCHEMA)
     save(runs, directory / "runs" / "VC" / scene.identifier / f"seeds_00000-{num_seeds - 1:05d}.nc")
+
+
+def test_consistency_tells_bounds_failed_runs_and_paired_differences_of_each_gate(tmp_path, capsys, monkeypatch):
+    """In its files, not only on the screen."""
+    study = script("consistency")
+    worked = []
+
+    def monte_carlo(scenario, config, *, num_seeds, **_):
+        worked.append((type(config.gate).__name__, config.errors, scenario.num_frames))
+        runs = fake_runs(MOVING, num_seeds=num_seeds)
+        scale = 1 + 0.1 * runs.seed if config.errors == "invariant" else 1.0
+        runs = runs.assign(position_error_m=runs.position_error_m * scale)
+        return with_failed_seed(runs, 3) if config.errors == "invariant" else runs
+
+    monkeypatch.setattr(study.vc, "monte_carlo", monte_carlo)
+    study.main(study.Study(seeds=6, gates=("RE", "VC"), out=tmp_path))
+    assert len(worked) == len(set(worked)) == 8
+    report, table = json.loads((tmp_path / "consistency.json").read_text()), (tmp_path / "consistency.md").read_text()
+    assert len(report) == 8 and capsys.readouterr().out.strip() in table
+    cell = report["8 m, yaw 0.05 deg, VC, invariant"]
+    assert (cell["num_runs"], cell["runs_failed"], cell["less_additive"]["num_pairs"]) == (6, 1, 5)
+    for name, dof in (("anees_position", 2), ("anees_pose", 3), ("anees_map", 3)):
+        expected = stats.chi2.ppf([0.025, 0.975], 5 * dof) / (5 * dof)
+        assert list(cell["anees_bounds"][name].values()) == pytest.approx(expected)
+    difference = cell["less_additive"]["position_rmse_cm"]
+    assert difference["lower"] < difference["mean"] < difference["upper"] and "| 6, 1 |" in table
+    assert "{mean:+.3f} [{lower:+.3f}, {upper:+.3f}]".format(**difference) in table
 
 
 @pytest.fixture

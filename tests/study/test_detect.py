@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from fake_runs import fake_runs
+from scipy import stats
 
 from vcjax.study import reproduce
 from vcjax.study.detect import detect
@@ -91,6 +92,9 @@ def test_scores_equal_python_loops():
     assert score["position_ratio"]["mean"] == pytest.approx(rmse.mean() / static_rmse.mean())
     anees = runs.nees_position.values[good].mean(1) / 2
     assert score["anees_position"]["mean"] == pytest.approx(anees.mean())
+    assert score["anees_map"]["mean"] == pytest.approx(runs.nees_map.values[good].mean() / 3)
+    low, high = stats.chi2.ppf([0.025, 0.975], 3 * (NUM_SEEDS - 1)) / (3 * (NUM_SEEDS - 1))
+    assert score["anees_bounds"]["anees_map"] == pytest.approx({"lower": low, "upper": high})
 
 
 def test_the_error_of_a_pooled_share_is_its_spread_over_many_studies():

@@ -15,7 +15,7 @@ from vcjax.study.detect import Detection
 from vcjax.study.detection_methods import METHODS
 from vcjax.study.detection_scores import MIN_FRAMES_MAPPED, scores
 from vcjax.study.results import describe
-from vcjax.study.summary import paired_difference
+from vcjax.study.summary import DEGREES_OF_FREEDOM, paired_difference
 
 DIFFERENCES = ("position_rmse_cm", "orientation_error_deg")
 """Figures that are compared with the static scene's, seed by seed."""
@@ -31,7 +31,9 @@ _HEADER = (
     "position, cm",
     "against the static scene, cm",
     "ratio",
-    "ANEES",
+    "ANEES position",
+    "ANEES pose",
+    "ANEES map",
 )
 _INTRODUCTION = f"""\
 *Movers found*: unique movers flagged of those in the map for at least {MIN_FRAMES_MAPPED} frames or flagged, features
@@ -41,8 +43,9 @@ denominator; *static flagged*: static features ever flagged of those ever mapped
 first deletion of the movers found; *velocity error*: |v̂ − v| of movers when they were flagged, of methods that estimate
 it, and in brackets its NEES / 3; *position*: RMS error of a run; *against the static scene*: the difference of it from
 the same seeds without movers, with its 95 % interval, bold where that excludes zero; *ratio*: of the two errors;
-*ANEES*: of the position, 1 of a consistent filter. ± is a standard error over runs, which is 0 where all runs agree.
-The features that are flagged are those that gate or detector has ever deleted.
+*ANEES*: of position, pose and the places of the map's static landmarks, 1 of a consistent filter, bold outside the
+bounds in which 95 % of averages over so many runs lie. ± is a standard error over runs, which is 0 where all runs
+agree. The features that are flagged are those that gate or detector has ever deleted.
 """
 
 
@@ -163,7 +166,7 @@ def _row(cell: Mapping[str, Any]) -> list[str]:
         _text(cell["position_rmse_cm"], 2),
         "–" if difference is None else _interval(difference),
         "–" if difference is None else _text(cell["position_ratio"], 2),
-        _text(cell["anees_position"], 2),
+        *(_anees(cell, name) for name in DEGREES_OF_FREEDOM),
     ]
 
 
@@ -173,6 +176,12 @@ def _text(figure: Mapping[str, float], decimals: int, factor: float = 1.0) -> st
     if not math.isfinite(mean):
         return "–"
     return f"{mean:.{decimals}f}" + (f" ± {error:.{decimals}f}" if math.isfinite(error) else "")
+
+
+def _anees(cell: Mapping[str, Any], name: str) -> str:
+    text, bounds = _text(cell[name], 2), cell["anees_bounds"][name]
+    is_outside = not bounds["lower"] <= cell[name]["mean"] <= bounds["upper"]
+    return f"**{text}**" if is_outside and math.isfinite(cell[name]["mean"]) else text
 
 
 def _velocity(cell: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Int
 
-from vcjax.study.summary import mean_and_error, per_run
+from vcjax.study.summary import DEGREES_OF_FREEDOM, anees_bounds, mean_and_error, per_run
 
 MIN_FRAMES_MAPPED = 20
 """In `found_fraction` a mover counts if it was in the map for so many frames, or was flagged."""
@@ -52,11 +52,13 @@ def scores(runs: xr.Dataset, static: xr.Dataset) -> dict[str, Any]:
         `MIN_FRAMES_MAPPED` frames or flagged, which flatters: one that was mapped for less counts if it was found and
         not if it was missed; `found_of_mapped_fraction`, of all movers ever mapped, and `found_per_run`, unique movers
         flagged in a run; `static_flagged_fraction`, static features ever flagged of those ever mapped; `delay_frames`,
-        from first birth to first deletion of the movers found; `position_rmse_cm`, `orientation_error_deg` and
-        `anees_position` of a run; `velocity_error_m_s` and `velocity_nees` (over 3) of the movers whose velocity was
-        known when they were flagged; and `position_ratio`, position error against the static scene's over the seeds
-        finite in both. Counts: `movers`, `movers_mapped`, `movers_found`, `static_mapped`, `static_flagged`, `runs`,
-        `runs_failed` and `runs_map_full`. Failed runs are left out. NaN where there is nothing to count.
+        from first birth to first deletion of the movers found; `position_rmse_cm`, `orientation_error_deg`,
+        `anees_position`, `anees_pose` and `anees_map` of a run; `velocity_error_m_s` and `velocity_nees` (over 3) of
+        the movers whose velocity was known when they were flagged; and `position_ratio`, position error against the
+        static scene's over the seeds finite in both. Counts: `movers`, `movers_mapped`, `movers_found`,
+        `static_mapped`, `static_flagged`, `runs`, `runs_failed` and `runs_map_full`. `anees_bounds` has, for each
+        ANEES, the `lower` and `upper` bound of 95 % of consistent filters (see `summary.summarise`). Failed runs are
+        left out. NaN where there is nothing to count.
 
     References: Cochran 1977, *Sampling Techniques*, section 2.11, for the standard error of a ratio.
     """
@@ -80,7 +82,8 @@ def scores(runs: xr.Dataset, static: xr.Dataset) -> dict[str, Any]:
         "delay_frames": pooled(delay.sum(axis=1), count.found),
         "velocity_error_m_s": pooled(error, is_known.sum(axis=1)),
         "velocity_nees": pooled(nees / 3, is_known.sum(axis=1)),
-        **{name: _mean(figures[name]) for name in ("position_rmse_cm", "orientation_error_deg", "anees_position")},
+        **{name: _mean(figures[name]) for name in ("position_rmse_cm", "orientation_error_deg", *DEGREES_OF_FREEDOM)},
+        "anees_bounds": {name: _bounds(figures[name], dof) for name, dof in DEGREES_OF_FREEDOM.items()},
         "position_ratio": pooled(*rmse),
         "movers": int(movers.sum()),
         "movers_mapped": int(count.movers.sum()),
@@ -107,3 +110,9 @@ def _mean(values: xr.DataArray) -> dict[str, float]:
     """Mean and standard error over the runs that have it."""
     mean, error = mean_and_error(values, values.notnull())
     return {"mean": float(mean), "se": float(error)}
+
+
+def _bounds(values: xr.DataArray, dof: int) -> dict[str, float]:
+    """Of an average of consistent runs, as many as have it."""
+    lower, upper = anees_bounds(int(values.notnull().sum()) or np.nan, dof)
+    return {"lower": float(lower), "upper": float(upper)}

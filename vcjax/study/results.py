@@ -54,6 +54,8 @@ PER_FEATURE = {
     "velocity_nees": "the same, normalised and squared, 3 degrees of freedom",
 }
 PER_RUN = {
+    "nees_map": "normalised error squared of the places of static Euclidean landmarks in the last frame, 3 degrees of "
+    "freedom, mean over them; NaN: none",
     "is_finite": "whether all numbers of the run stayed finite",
     "detection_auc": "share of pairs of a mover and another feature that dynamic_margin puts in the right order",
     "detector_auc": "share of pairs of a mover and another feature that detector_margin puts in the right order",
