@@ -77,7 +77,8 @@ def test_damage_is_against_the_scene_that_is_the_same_without_movers(tmp_path, c
     assert f"{moving.identifier}: 7 seeds, static scene 5.00 cm, damage +3.00 ± 0.00 cm" in told
     assert f"{jittery.identifier}: 7 seeds, static scene 11.00 cm, damage +1.00 ± 0.00 cm" in told and "nan" not in told
     few = tmp_path / "few"
-    written(few, moving, 1, 5.0), written(few, moving.static, 1, 2.0)
+    written(few, moving, 1, 5.0)
+    written(few, moving.static, 1, 2.0)
     damage.main(damage.Study(few, ("VC",)))
     told = capsys.readouterr().out
     assert "too few seeds to tell (1; at least 6)" in told and "nan" not in told

@@ -73,7 +73,7 @@ def test_the_statistic_of_a_static_scene_is_chi_squared_with_the_whole_filter():
     observed yet the prior fades the statistic out, so that it may be somewhat smaller than χ²₃, and is not larger.
     """
     num_runs, scenario = 20, vc.scenarios.paper(oscillation_amplitude_m=0.1, num_frames=100)
-    config = vc.FilterConfig(gate=vc.ReprojectionError(1e9), detector=vc.VelocityGLR(threshold=1e9), max_updates=60)
+    config = vc.FilterConfig(gate=vc.ReprojectionError(th1=1e9), detector=vc.VelocityGLR(threshold=1e9), max_updates=60)
 
     def last_of_each_track(key):
         info = vc.run(config, vc.simulate(scenario, key)[0])[1]

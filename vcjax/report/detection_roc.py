@@ -41,7 +41,7 @@ def curves_markdown(table: Sequence[Mapping[str, Any]]) -> str:
     header = ("camera", "method", "threshold", "static flagged, %", "movers found, %", "precision, %")
     rows = [
         [
-            _camera(line),
+            _camera(amplitude),
             line["detector"],
             f"{point['threshold']:g}",
             _text(point["static_flagged_fraction"], 2),
@@ -89,7 +89,7 @@ def _panels(table: Sequence[Mapping[str, Any]], across: str, up: str) -> tuple[F
             axes.fill_between(x[0], y[1], y[2], color=style["color"], alpha=0.15, linewidth=0)
             axes.errorbar(x[0], y[0], xerr=np.abs(x[1:] - x[0]), **style)
         axes.set_ylim(0, 1.02)
-        axes.set_title(_camera(line))
+        axes.set_title(_camera(amplitude))
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=min(3, len(names)))
     figure.suptitle("All scenes with movers, a run for each threshold, 95 % intervals", fontsize=10)
@@ -101,8 +101,8 @@ def _values(line: Mapping[str, Any], name: str) -> np.ndarray:
     return np.array([[point[name][part] for point in line["points"]] for part in ("mean", "lower", "upper")])
 
 
-def _camera(line: Mapping[str, Any]) -> str:
-    return f"A = {line['amplitude_m']:g} m" if line["amplitude_m"] else "steady"
+def _camera(amplitude_m: float) -> str:
+    return f"A = {amplitude_m:g} m" if amplitude_m else "steady"
 
 
 def _text(share: Mapping[str, float], decimals: int) -> str:
