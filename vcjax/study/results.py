@@ -144,10 +144,33 @@ def refuse_other_settings(path: str | os.PathLike, found: Mapping[str, Any], exp
     """
     for name, value in expected.items():
         if found.get(name) != value:
+            place, one, other = _first_difference(name, found.get(name), value)
             raise ValueError(
-                f"{path} has other settings ({name}: {_short(found.get(name))}, now {_short(value)}); "
+                f"{path} has other settings ({place}: {_short(one)}, now {_short(other)}); "
                 "give another directory, or remove this one."
             )
+
+
+def _first_difference(name: str, found: Any, expected: Any) -> tuple[str, Any, Any]:
+    """The first part in which two descriptions differ: its path, and what each has there."""
+    one, other = _parsed(found), _parsed(expected)
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        parts = [(key, one.get(key), other.get(key)) for key in {**other, **one}]
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other) and _short(one) == _short(other):
+        parts = list(zip(range(len(one)), one, other, strict=True))
+    else:
+        parts = []
+    differing = ((f"{name}.{key}", *pair) for key, *pair in parts if pair[0] != pair[1])
+    place = next(differing, None)
+    return (name, one, other) if place is None else _first_difference(*place)
+
+
+def _parsed(value: Any) -> Any:
+    """A description kept as text, as it was."""
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 def _short(value: Any) -> str:
