@@ -88,7 +88,7 @@ INVERSE_FORWARD = scenarios["inverse forward, 0.5 m/s"]
 def one_run(experiment, values, key):
     """The objective of one run with some numbers changed."""
     experiment = replace_at(experiment, values)
-    info, truth = simulate_and_filter(experiment, key)
+    _, info, truth = simulate_and_filter(experiment, key)
     return {"loss": objective(experiment.scenario, info, truth)}
 
 

@@ -254,7 +254,7 @@ soft_filter = vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")
 def one_run(experiment, values, key):
     """The objective of one run with some numbers changed."""
     experiment = replace_at(experiment, values)
-    info, truth = simulate_and_filter(experiment, key)
+    _, info, truth = simulate_and_filter(experiment, key)
     return {"loss": objective(experiment.scenario, info, truth)}
 
 

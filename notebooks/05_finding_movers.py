@@ -47,11 +47,12 @@ from vcjax.detectability.chi_squared import survival
 from vcjax.detectability.survey import predict_movers
 from vcjax.detectability.velocity_test import VelocityTest
 from vcjax.report.detection_tables import detection_tables
-from vcjax.study.detect import METHODS, detect
+from vcjax.study.detect import detect
+from vcjax.study.detection_methods import METHODS
 
 SPEED_M_S, A_M = 0.5, 0.1
 THRESHOLD = 17.0
-FILTER = METHODS["RE+velocity_glr"]
+FILTER = METHODS["RE+velocity_glr"].config
 assert isinstance(FILTER.detector, vc.VelocityGLR) and FILTER.detector.threshold == THRESHOLD
 steady, swinging = (
     vc.scenarios.paper(dynamic="inverse_forward", dynamic_speed_m_s=SPEED_M_S, oscillation_amplitude_m=a)
@@ -189,7 +190,7 @@ assert predicted["steady"].power_of_all_frames.max() < 1e-3 and predicted["swing
 
 # %%
 with tempfile.TemporaryDirectory() as directory:
-    runs = detect(
+    found = detect(
         directory,
         ("RE", "VC", "RE+velocity_glr"),
         amplitudes_m=(0.0, A_M),
@@ -197,7 +198,7 @@ with tempfile.TemporaryDirectory() as directory:
         num_seeds=6,
         key=jax.random.key(0),
     )
-tables = detection_tables(runs)
+tables = detection_tables(found)
 print(f"{'scene':28} {'camera':9} {'method':16} found  flagged  position (without movers)")
 for cell in sorted(tables["cells"], key=lambda cell: (cell["label"], cell["amplitude_m"])):
     print(

@@ -1,12 +1,12 @@
-"""Is the filter as sure as it may be? ANEES and error with additive and with invariant errors, on two paths.
+"""Is the filter as sure as it may be? ANEES and error of gates with additive and with invariant errors, on two paths.
 
 python scripts/consistency.py --seeds 200
 """
 
 import dataclasses
-import json
 import os
 from pathlib import Path
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -14,11 +14,26 @@ import tyro
 
 import vcjax as vc
 from vcjax.report.markup import grid
-from vcjax.storage import write_file
-from vcjax.study.summary import paired_difference
+from vcjax.storage import write_file, write_json
+from vcjax.study.reproduce import GATES
+from vcjax.study.summary import DEGREES_OF_FREEDOM, paired_difference
 
 LOOP_M, LOOP_FRAMES = 100.0, 1000
-COLUMNS = ("position, cm", "orientation, deg", "ANEES position", "ANEES pose", "… in the last frame")
+FIGURES = ("position_rmse_cm", "orientation_error_deg", *DEGREES_OF_FREEDOM)
+COLUMNS = (
+    "position, cm",
+    "orientation, deg",
+    *(f"ANEES {name.removeprefix('anees_')}" for name in DEGREES_OF_FREEDOM),
+    "ANEES pose, last frame",
+    "runs, failed",
+    "position, invariant − additive, cm",
+)
+
+
+BOUNDS = """\
+In brackets the bounds in which 95 % of averages of consistent filters lie, by the χ² of so many runs; of the
+difference, paired by seed, its 95 % interval.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +42,8 @@ class Study:
 
     seeds: int = 200
     """Runs of each."""
+    gates: tuple[Literal["RE", "VC", "one_point_ransac"], ...] = ("RE",)
+    """Which."""
     yaw_std_deg: tuple[float, ...] = (0.05,)
     """Noise of the odometry's rotation per frame, deg (the paper: 0.05)."""
     out: Path = Path("results/consistency")
@@ -51,35 +68,60 @@ def main(study: Study) -> None:
     for name, path in paths.items():
         for yaw_std in study.yaw_std_deg:
             scenario = dataclasses.replace(path, odometry_std=(0.005, 0.005, 0.0, 0.0, 0.0, yaw_std))
-            slots = 107 if path.num_frames < LOOP_FRAMES else 251
-            runs = {
-                errors: vc.monte_carlo(
-                    scenario,
-                    vc.FilterConfig(gate=vc.ReprojectionError(), errors=errors, max_landmarks=slots),
-                    num_seeds=study.seeds,
-                    key=jax.random.key(0),
-                )
-                for errors in ("additive", "invariant")
-            }
-            difference = paired_difference(runs["invariant"], runs["additive"])
-            for errors, found in runs.items():
-                summary = vc.summarise(found)
-                figures = {
-                    figure: {part: float(summary[figure].sel(statistic=part)) for part in ("mean", "se")}
-                    for figure in ("position_rmse_cm", "orientation_error_deg", "anees_position", "anees_pose")
-                }
-                last = found.nees_pose.isel(frame=-1).mean().item() / 3
-                report[f"{name}, yaw {yaw_std} deg, {errors}"] = figures | {
-                    "anees_pose_at_the_end": last,
-                    "map_full_runs": int((found.map_full_frames > 0).sum()),
-                }
-                text = [f"{each['mean']:.3f} ± {each['se']:.3f}" for each in figures.values()]
-                rows.append([name, f"{yaw_std:g}", errors, *text, f"{last:.2f}"])
-            position = difference["position_rmse_cm"]
-            low, high = (float(position.sel(statistic=part)) for part in ("lower", "upper"))
-            print(f"{name}, yaw {yaw_std:g} deg: invariant − additive: [{low:+.3f}, {high:+.3f}] cm", flush=True)
-    print(grid(("path", "yaw noise, deg", "errors", *COLUMNS), rows))
-    write_file(study.out / "consistency.json", f"{json.dumps(report, indent=1)}\n".encode())
+            for gate in study.gates:
+                found = compared(scenario, gate, study.seeds)
+                for errors, cell in found.items():
+                    report[f"{name}, yaw {yaw_std} deg, {gate}, {errors}"] = cell
+                    rows.append([name, f"{yaw_std:g}", gate, errors, *texts(cell)])
+    table = grid(("path", "yaw noise, deg", "gate", "errors", *COLUMNS), rows)
+    print(table)
+    write_json(study.out / "consistency.json", report)
+    write_file(study.out / "consistency.md", f"{BOUNDS}\n{table}".encode())
+
+
+def compared(scenario: vc.Scenario, gate: str, num_seeds: int) -> dict[str, dict[str, Any]]:
+    """Figures of both kinds of errors, their bounds, and the difference, paired by seed."""
+    slots = 107 if scenario.num_frames < LOOP_FRAMES else 251
+    runs = {
+        errors: vc.monte_carlo(
+            scenario,
+            vc.FilterConfig(gate=GATES[gate](), errors=errors, max_landmarks=slots),
+            num_seeds=num_seeds,
+            key=jax.random.key(0),
+        )
+        for errors in ("additive", "invariant")
+    }
+    difference = paired_difference(runs["invariant"], runs["additive"])
+    result = {}
+    for errors, found in runs.items():
+        summary = vc.summarise(found)
+        result[errors] = {
+            **{name: {part: float(summary[name].sel(statistic=part)) for part in ("mean", "se")} for name in FIGURES},
+            "anees_bounds": {
+                name: {bound: float(summary[f"{name}_bounds"].sel(bound=bound)) for bound in ("lower", "upper")}
+                for name in DEGREES_OF_FREEDOM
+            },
+            "anees_pose_at_the_end": found.nees_pose.isel(frame=-1).where(found.is_finite).mean().item() / 3,
+            **{name: int(summary[name]) for name in ("num_runs", "runs_failed", "runs_map_full")},
+        }
+    result["invariant"]["less_additive"] = {
+        name: {part: float(difference[name].sel(statistic=part)) for part in ("mean", "lower", "upper")}
+        for name in FIGURES
+    } | {"num_pairs": int(difference.num_pairs)}
+    return result
+
+
+def texts(cell: dict[str, Any]) -> list[str]:
+    """A row's figures: means with standard errors, bounds, and the paired difference where there is one."""
+    means = [f"{cell[name]['mean']:.3f} ± {cell[name]['se']:.3f}" for name in FIGURES]
+    bounds = [""] * 2 + [" [{lower:.2f}, {upper:.2f}]".format(**each) for each in cell["anees_bounds"].values()]
+    difference = cell.get("less_additive", {}).get("position_rmse_cm")
+    return [
+        *(mean + bound for mean, bound in zip(means, bounds, strict=True)),
+        f"{cell['anees_pose_at_the_end']:.2f}",
+        f"{cell['num_runs']}, {cell['runs_failed']}",
+        "" if difference is None else "{mean:+.3f} [{lower:+.3f}, {upper:+.3f}]".format(**difference),
+    ]
 
 
 if __name__ == "__main__":

@@ -63,6 +63,7 @@ def fake_runs(cell: Cell | None = None, num_seeds: int = 4, num_frames: int = 20
             "yaw_error_deg": (per_frame, yaw),
             "nees_position": (per_frame, np.sum(shared[:2] ** 2, axis=0)),
             "nees_pose": (per_frame, np.sum(shared[:3] ** 2, axis=0)),
+            "nees_map": ("seed", np.sum(shared[:3, :, -1] ** 2, axis=0)),
             "nis_sum": (per_frame, 2.0 * shared[3] ** 2 * 8),
             "num_updates": (per_frame, np.full((num_seeds, num_frames), 8)),
             "num_recovered": (per_frame, events(recovered)),

@@ -147,7 +147,7 @@ def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsy
             "simulate --coordinator here:99999 --num-processes 1 --process-id 0",
             ["--coordinator here:99999: give HOST:PORT"],
         ),
-        ("simulate --key 99999999999999999999", ["--key 99999999999999999999", "64 bits"]),
+        ("simulate --key 99999999999999999999", ["--key 99999999999999999999", "from 0 to 2**63 - 1"]),
         ("simulate --nonsense 3", ["--nonsense"]),
         ("simulate --gate XX", ["'XX'", "--gate", "'RE', 'VC'"]),
         ("simulate --gate RE --th2 3", ["--th2", "--th1"]),
@@ -182,6 +182,8 @@ def test_every_number_of_the_scenario_has_an_option(tmp_path, monkeypatch, capsy
         ("simulate --detector velocity_glr --false-alarm-rate 2", ["VelocityGLR(false_alarm_rate=2.0)", "(0, 1)"]),
         ("simulate --detector velocity_glr --forgetting 0.9", ["VelocityGLR(forgetting=0.9)", "give a threshold"]),
         ("simulate --max-followed 8", ["Following(max_followed=8)", "set blacklist_capacity"]),
+        ("simulate --key -1", ["--key -1", "from 0"]),
+        ("detect --key -1", ["--key -1", "from 0"]),
         ("simulate --blacklist-frames -1", ["FilterConfig(blacklist_frames=-1.0)", "infinity: for good"]),
     ],
 )

@@ -19,7 +19,10 @@ TINY += ["--methods", "VC", "RE"]
 
 @pytest.fixture(autouse=True)
 def small_maps(monkeypatch):
-    small = {name: dataclasses.replace(config, **tiny_runs.CAPACITIES) for name, config in module.METHODS.items()}
+    small = {
+        name: method._replace(config=dataclasses.replace(method.config, **tiny_runs.CAPACITIES))
+        for name, method in module.METHODS.items()
+    }
     monkeypatch.setattr(module, "METHODS", small)
     # In so few frames only what is near the start is mapped.
     near = tiny_runs.scenario().landmarks_m[tiny_runs.MOVERS]
@@ -49,7 +52,10 @@ def test_detect_writes_its_scores_and_goes_on_where_it_stopped(tmp_path, capsys,
     assert len(content["cells"]) == 8 and len(content["static_cells"]) == 12
     for cell in content["cells"]:
         assert cell["dynamic_motion"] == "lateral" and cell["runs"] == 3 and cell["runs_failed"] == 0
-        for name in ("found_fraction", "static_flagged_fraction", "delay_frames", "anees_position"):
+        assert list(cell["anees_bounds"]) == ["anees_position", "anees_pose", "anees_map"]
+        for name in ("static_flagged_fraction", "delay_frames", "anees_position", "anees_pose", "anees_map"):
+            assert set(cell[name]) == {"mean", "se"}
+        for name in ("found_fraction", "found_of_mapped_fraction", "found_per_run"):
             assert set(cell[name]) == {"mean", "se"}
         difference = cell["difference"]["position_rmse_cm"]
         expected = cell["position_rmse_cm"]["mean"] - cell["static_scene_position_rmse_cm"]["mean"]
@@ -76,6 +82,30 @@ def test_detect_writes_its_scores_and_goes_on_where_it_stopped(tmp_path, capsys,
     assert main([*arguments, "--seeds", "3", "--key", "1"]) == 1
     assert_one_line(said(capsys)[1], "other settings (key: ", "give another directory")
     assert (tmp_path / "detect.json").read_bytes() == before
+
+
+def test_curves_are_run_when_asked_for(tmp_path, capsys):
+    """At every threshold in the scenes with movers, with nothing compiled again for another."""
+    arguments = ["detect", *TINY, "--methods", "VC", "--out", str(tmp_path), "--seeds", "2"]
+    assert main(arguments) == 0
+    assert not (tmp_path / "curves").exists() and not (tmp_path / "figures" / "roc.png").exists()
+    assert "At other thresholds" not in said(capsys)[0]
+    with tiny_runs.compilations() as compiled:
+        assert main([*arguments, "--curves"]) == 0
+    printed, told = said(capsys)
+    assert compiled.num == 0
+    for name in ("roc", "precision_recall"):
+        assert f"wrote {tmp_path / 'figures' / name}.png" in told
+    thresholds = module.METHODS["VC"].curve
+    assert len(list(tmp_path.glob("curves/VC/threshold_*/*/seeds_00000-00001.nc"))) == 2 * 2 * (len(thresholds) - 1)
+    curves = json.loads((tmp_path / "detect.json").read_text())["curves"]
+    assert [(line["detector"], line["amplitude_m"]) for line in curves] == [("VC", 0.0), ("VC", 0.1)]
+    for line in curves:
+        assert [point["threshold"] for point in line["points"]] == list(thresholds)
+        strictest = line["points"][-1]
+        assert 0 <= strictest["found_of_mapped_fraction"]["mean"] <= 1 and strictest["flagged"] <= strictest["static"]
+        assert line["points"][0]["found"] > strictest["found"]
+    assert "## At other thresholds" in printed and "| steady | VC | 9 |" in printed
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from told import assert_one_line, said
 
 from vcjax.cli import main
 from vcjax.commands import detectability as module
+from vcjax.report.detectability import around_figure, markdown
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # as people have it
 TINY = ["--num-frames", "30", "--spacing-m", "4", "--speeds-m-s", "1", "--within-frames", "20"]
@@ -34,6 +35,19 @@ def test_maps_tables_and_the_best_oscillation(tmp_path, capsys):
         assert f"wrote {tmp_path / 'figures' / name}.png" in told and (tmp_path / "figures" / f"{name}.svg").is_file()
 
 
+def test_ends_of_the_search_and_heights_of_places_are_told(tmp_path, capsys, monkeypatch):
+    seen = []
+    monkeypatch.setattr(module, "write_detectability", lambda found, _: seen.append(found) or [])
+    (tmp_path / "detectability.md").write_text("")
+    assert main(["detectability", *TINY, "--out", str(tmp_path)]) == 0
+    (found,) = seen
+    inside, at_the_end = (found._replace(best=found.best._replace(at_the_end=ends)) for ends in ((), ("A", "f")))
+    assert "A and f lie at an end of what was searched, 0 to 0.15 m and 0.5 to 4.5 Hz" in markdown(at_the_end)
+    assert "at an end" not in markdown(inside)
+    titles = [axes.get_title() for axes in around_figure(found).axes]
+    assert titles == ["from (4, -2, 0) m", "from (4, 0, 0) m", "from (4, 2, 0) m"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -48,7 +62,8 @@ def test_maps_tables_and_the_best_oscillation(tmp_path, capsys):
         (["--amplitudes-m", "-0.1"], ["amplitude_m=-0.1"]),
         (["--amplitudes-m"], ["--amplitudes-m", "at least one"]),
         (["--speeds-m-s"], ["speeds_m_s=()", "at least one"]),
-        (["--headings-deg"], ["headings_deg=()", "at least one"]),
+        (["--headings-deg"], ["headings_deg=()", "at least one number, finite."]),
+        (["--headings-deg", "nan"], ["headings_deg=(nan,)", "at least one number, finite."]),
         (["--price", "-1"], ["price=-1", "at least 0"]),
         (["--num-frames", "0"], ["num_frames=0"]),
         (["--pose-noise", "-1"], ["pose_noise=-1.0"]),

@@ -48,7 +48,7 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
 
     # What is of other settings is refused before any work, as far as that can be known then.
     for changed, *words in (
-        (["--learning-rate", "0.1"], "start_0.json", "other settings (schedule: ", "give another directory"),
+        (["--learning-rate", "0.1"], "start_0.json", "other settings (schedule.", "give another directory"),
         (["--choosing-seeds", "3"], "candidates", "other settings (num_seeds: 2, now 3)"),
         (["--held-out-seeds", "4"], "held_out", "other settings (num_seeds: 3, now 4)"),
         (["--landscape-points", "4"], "landscape_thresholds", "another number of settings than"),
@@ -59,7 +59,7 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     for path in (folder / "descents").iterdir():
         path.unlink()  # the steps were lost: what they led to is found beside them
     assert main([*arguments, "--position", "3"]) == 1
-    assert_one_line(said(capsys)[1], "settings_00000-", "other settings (objective: ")
+    assert_one_line(said(capsys)[1], "settings_00000-", "other settings (objective.")
 
 
 def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):

@@ -107,6 +107,12 @@ def cost(part):
     return cost_and_gradient(stacked(SCENES), TEST, 0.05, tuple(INTERVALS.values()), jnp.asarray(part))
 
 
+def test_an_oscillation_at_the_end_of_what_was_searched_says_so():
+    """For nothing, the largest is best."""
+    found = best_oscillation(SCENES, TEST, price=0.0, intervals=INTERVALS, num_starts=1)
+    assert "A" in found.at_the_end and found.amplitude_m == pytest.approx(0.08)
+
+
 def test_the_gradient_of_the_cost_is_a_finite_difference():
     x, h = np.array([0.6, 0.45]), 1e-5
     differences = [float(cost(x + h * e)[0][0] - cost(x - h * e)[0][0]) / (2 * h) for e in np.eye(2)]
@@ -120,6 +126,11 @@ def test_the_best_oscillation_is_at_least_as_good_as_a_grid():
     values = [float(cost(part)[0][0]) for part in itertools.product(np.linspace(0, 1, 9), repeat=2)]
     assert best.cost <= min(values) + 1e-6
     assert 0 < best.amplitude_m <= 0.08 and 0.5 <= best.frequency_hz <= 4.5
+    assert best.at_the_end == tuple(
+        name
+        for name, value, end in zip("Af", best[:2], INTERVALS.values(), strict=True)
+        if np.isclose([end.low, end.high], value, rtol=1e-3).any()
+    )
     motion = 0.5 * (2 * np.pi * best.frequency_hz * best.amplitude_m) ** 2
     np.testing.assert_allclose(best.camera_motion_m2_s2, motion, rtol=1e-9)
     np.testing.assert_allclose(best.cost, best.missed + 0.05 * motion, rtol=1e-9)

@@ -170,6 +170,15 @@ def test_a_pixel_from_elsewhere_loses_the_feature():
             lambda: FilterConfig(following=Following(max_followed=4)),
             r"max_followed=4.*must stay out of the map; set blacklist_capacity",
         ),
+        (
+            lambda: FilterConfig(following=Following(max_followed=9), blacklist_capacity=8),
+            r"max_followed=9.*blacklist_capacity=8.*at least as large",
+        ),
+        (
+            lambda: FilterConfig(following=Following(max_followed=4), blacklist_capacity=8, blacklist_frames=30),
+            r"blacklist_frames=30.0, following=.*max_followed=4.*born again.*infinite",
+        ),
+        (lambda: FilterConfig(blacklist_frames=30), r"blacklist_frames=30.0, blacklist_capacity=0.*set blacklist"),
         (lambda: FilterConfig(following=True, blacklist_capacity=9), r"following=True.*give a Following"),
     ],
 )

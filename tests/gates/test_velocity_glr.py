@@ -41,7 +41,7 @@ def glr_plainly(detector, record):
         margin = np.full(NUM_SLOTS, np.nan)
         for i in range(NUM_SLOTS):
             statistic = d[i] @ np.linalg.solve(D[i] + np.eye(3) / sigma2, d[i])
-            bound = -2 * np.log(detector.false_alarm_rate) + np.linalg.slogdet(np.eye(3) + sigma2 * D[i])[1]
+            bound = -2 * np.log(detector.false_alarm_rate or 1) + np.linalg.slogdet(np.eye(3) + sigma2 * D[i])[1]
             if np.trace(C[i]) > 0:
                 margin[i] = statistic - (bound if detector.threshold is None else detector.threshold)
         yield B.copy(), d.copy(), C.copy(), D.copy(), offset.copy(), less.copy(), margin
@@ -232,6 +232,7 @@ def test_derivatives_are_finite_differences():
         (dict(false_alarm_rate=0.0), r"VelocityGLR\(false_alarm_rate=0.0\): .*\(0, 1\)"),
         (dict(false_alarm_rate=1.5), r"VelocityGLR\(false_alarm_rate=1.5\)"),
         (dict(threshold=-1), r"VelocityGLR\(threshold=-1.0\): .*positive χ²"),
+        (dict(false_alarm_rate=0.01, threshold=17), r"\(false_alarm_rate=0.01, threshold=17.0\): .*one of them"),
         (dict(velocity_std_m_s=0), r"VelocityGLR\(velocity_std_m_s=0.0\)"),
         (dict(threshold=20, forgetting=1.1), r"VelocityGLR\(forgetting=1.1\): .*\(0, 1\]"),
         (dict(forgetting=0.9), r"VelocityGLR\(forgetting=0.9\).*give a threshold, or forgetting=1"),
@@ -240,3 +241,9 @@ def test_derivatives_are_finite_differences():
 def test_bad_input_is_refused_by_name_and_value(fields, message):
     with pytest.raises(ValueError, match=message):
         VelocityGLR(**fields)
+
+
+def test_the_rate_is_one_percent_unless_another_or_a_threshold_is_given():
+    state = VelocityGLR().born()
+    assert VelocityGLR().margin(state) == VelocityGLR(false_alarm_rate=0.01).margin(state) == 2 * np.log(0.01)
+    assert VelocityGLR(threshold=17.0).margin(state) == -17

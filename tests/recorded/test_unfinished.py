@@ -76,7 +76,7 @@ def test_another_run_is_refused_and_damage_is_said(tmp_path):
     with pytest.raises(Stopped):
         run(folder, stop_after(24))
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(ValueError, match=r"unfinished has other settings \(config: .*give another directory"):
+    with pytest.raises(ValueError, match=r"unfinished has other settings \(config\..*give another directory"):
         run(folder, gate=vc.VirtualCorrection(th1=5.0))
     with pytest.raises(ValueError, match=r"unfinished has other settings \(config: .*give another directory"):
         run(folder, blacklist_frames=50.0)

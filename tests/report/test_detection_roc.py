@@ -1,44 +1,45 @@
-"""Curves of methods: what is pooled, and what a score that tells all or nothing gives."""
+"""Operating curves as tables and figures: every method at every amplitude, whatever is unknown."""
 
 import numpy as np
-from fake_runs import fake_runs
 
-from vcjax.report.detection_roc import _pooled, roc_figure, separation
-from vcjax.study.detection_scenes import Scene
-from vcjax.study.paper import Cell
+from vcjax.report.detection_roc import curves_markdown, curves_table, precision_figure, roc_figure
+from vcjax.study.detection_scores import Counts
 
-RUNS = fake_runs(Cell(4, "forward", "lateral", 1.0, "VC", True), num_seeds=6)
+SEEDS = 5
 
 
-def scored(score):
-    """The runs with a score for each feature, that of a detector alone."""
-    shape = RUNS.frames_mapped.shape
-    margin = (("seed", "feature"), np.broadcast_to(score, shape).astype(float))
-    nothing = (("seed", "feature"), np.full(shape, np.nan))
-    return RUNS.assign(detector_margin=margin, dynamic_margin=nothing, is_finite=("seed", np.ones(6, bool)))
+def made(found: int, flagged: int) -> Counts:
+    """The same counts in each seed, of six movers and fifty static features."""
+    return Counts(*(np.full(SEEDS, each) for each in (found, 6, flagged, 50)))
 
 
-def test_a_score_that_tells_movers_apart_has_an_area_of_one_and_one_that_does_not_of_a_half():
-    is_moving = RUNS.is_moving.values
-    told, blind = separation(scored(np.where(is_moving, 1.0, -1.0))), separation(scored(np.zeros(len(is_moving))))
-    assert told == {name: {"mean": 1.0, "lower": 1.0, "upper": 1.0} for name in ("auc", "recall_at_1_percent")}
-    assert blind["auc"] == {"mean": 0.5, "lower": 0.5, "upper": 0.5} and blind["recall_at_1_percent"]["mean"] == 0.0
-    rng = np.random.default_rng(0)
-    noisy = separation(scored(is_moving + rng.normal(size=(6, len(is_moving)))))["auc"]
-    assert 0.6 < noisy["lower"] < noisy["mean"] < noisy["upper"] < 0.9
+CURVES = {
+    ("RE", 0.0): {4.0: made(3, 5), 9.0: made(0, 0)},
+    ("RE+velocity_glr", 0.0): {8.0: made(6, 1), 17.0: made(5, 0)},
+    ("RE", 0.1): {4.0: made(6, 5), 9.0: made(3, 1)},
+}
 
 
-def test_the_tracks_of_one_seed_in_all_scenes_of_an_amplitude_belong_together():
-    apart, mixed = scored(np.where(RUNS.is_moving, 1.0, -1.0)), scored(np.zeros(RUNS.sizes["feature"]))
-    runs = {
-        ("VC", Scene(0.1, "lateral", 1.0)): apart,
-        ("VC", Scene(0.1, "lateral", 0.5)): mixed,
-        ("RE", Scene(0.1, "lateral", 0.5)): mixed,
-        ("VC", Scene(0.1, harder="late")): mixed,
-        ("VC", Scene(0.1)): mixed,
-    }
-    pooled = _pooled(runs)
-    assert set(pooled) == {(0.1, "VC"), (0.1, "RE")}
-    both = np.concatenate([apart.detector_margin, mixed.detector_margin], axis=1)
-    np.testing.assert_array_equal(pooled[0.1, "VC"].score, both)
-    assert [len(axes.lines) for axes in roc_figure(runs).axes] == [3, 2]  # of each method, and the 1 % line
+def test_points_are_told_with_intervals_and_a_dash_where_nothing_was_flagged():
+    table = curves_table(CURVES)
+    assert [(line["detector"], line["amplitude_m"], len(line["points"])) for line in table] == [
+        ("RE", 0.0, 2),
+        ("RE+velocity_glr", 0.0, 2),
+        ("RE", 0.1, 2),
+    ]
+    text = curves_markdown(table)
+    assert "| steady | RE | 4 | 10.00 [10.00, 10.00] | 50.0 [50.0, 50.0] | 37.5 [37.5, 37.5] |" in text
+    assert "| steady | RE | 9 | 0.00 [0.00, 0.00] | 0.0 [0.0, 0.0] | – |" in text
+    assert text.index("| A = 0.1 m | RE | 9 |") > text.index("| steady | RE+velocity_glr | 17 |")
+
+
+def test_a_panel_for_each_amplitude_has_the_points_of_its_methods():
+    roc, precision = (draw(curves_table(CURVES)) for draw in (roc_figure, precision_figure))
+    steady, swinging = (
+        {container.get_label(): container.lines[0].get_xydata() for container in axes.containers} for axes in roc.axes
+    )
+    assert set(steady) == {"RE", "RE+velocity_glr"} and set(swinging) == {"RE"}
+    np.testing.assert_allclose(steady["RE"], [[0.1, 0.5], [0, 0]])
+    np.testing.assert_allclose(swinging["RE"], [[0.1, 1.0], [0.02, 0.5]])
+    (points, _) = (container.lines[0].get_xydata() for container in precision.axes[0].containers)
+    np.testing.assert_allclose(points, [[0.5, 3 / 8], [0, np.nan]])

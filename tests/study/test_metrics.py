@@ -8,23 +8,29 @@ import pytest
 import tiny_runs
 from scipy.spatial.transform import Rotation
 
-from vcjax.study.metrics import run_metrics, trajectory_errors
+from vcjax.study.metrics import map_nees, run_metrics, trajectory_errors
 
 
 @pytest.fixture(scope="module")
-def run_and_truth():
-    """Info and truth of a run in which features were recovered and called dynamic, and some more invented deletions."""
+def whole_run():
+    """A run in which features were recovered and called dynamic, and some more invented deletions."""
     recording, truth = tiny_runs.simulate_once(tiny_runs.scenario(), jax.random.key(3))
-    _, info = tiny_runs.run_once(tiny_runs.config(tiny_runs.STRICT), recording)
-    info, truth = jax.device_get((info, truth))
+    state, info = tiny_runs.run_once(tiny_runs.config(tiny_runs.STRICT), recording)
+    state, info, truth = jax.device_get((state, info, truth))
     random = np.random.default_rng(0)
     ids = np.where(random.random(info.inconsistent_id.shape) < 0.1, random.integers(0, 20, info.track_id.shape), -1)
-    return eqx.tree_at(lambda i: i.inconsistent_id, info, ids.astype(np.int32)), truth
+    return state, eqx.tree_at(lambda i: i.inconsistent_id, info, ids.astype(np.int32)), truth
 
 
 @pytest.fixture(scope="module")
-def metrics(run_and_truth):
-    return jax.device_get(run_metrics(*as_jax(run_and_truth)))
+def run_and_truth(whole_run):
+    """Its info and truth."""
+    return whole_run[1:]
+
+
+@pytest.fixture(scope="module")
+def metrics(whole_run):
+    return jax.device_get(run_metrics(*as_jax(whole_run)))
 
 
 def as_jax(tree):
@@ -164,14 +170,14 @@ def test_counts_equal_python_loops(run_and_truth, metrics):
         assert metrics[name].sum() > 0, name  # there was something to count
 
 
-def test_flags_sum_up_the_frames(run_and_truth, metrics):
-    info, truth = run_and_truth
+def test_flags_sum_up_the_frames(whole_run, metrics):
+    state, info, truth = whole_run
     assert metrics["is_finite"] and metrics["map_full_frames"] == info.map_is_full.sum()
     num_frames = len(truth.robot)
     flags = eqx.tree_at(
         lambda i: (i.is_finite, i.map_is_full), info, (np.arange(num_frames) != 4, np.arange(num_frames) < 3)
     )
-    flagged = run_metrics(*as_jax((flags, truth)))
+    flagged = run_metrics(*as_jax((state, flags, truth)))
     assert not flagged["is_finite"] and flagged["map_full_frames"] == 3
 
 
@@ -187,3 +193,29 @@ def test_nees_is_not_defined_where_the_covariance_is_singular(run_and_truth, met
         assert np.flatnonzero(np.isnan(found[name])).tolist() == undefined
         others = np.setdiff1d(np.arange(len(cov)), [1, 2, 3, 4, 5])
         np.testing.assert_allclose(found[name][others], metrics[name][others], rtol=1e-9)
+
+
+def test_map_nees_is_of_the_static_euclidean_landmarks(whole_run):
+    """By NumPy's inverse of what each slot holds; of movers, and of points whose depth is not settled, none counts."""
+    state, _, truth = whole_run
+    rng, num_slots = np.random.default_rng(0), len(state.track_id)
+    ids = np.concatenate([[-1, -1], tiny_runs.MOVERS, np.arange(40, 40 + num_slots - 8)]).astype(np.int32)
+    is_euclidean = np.arange(num_slots) % 3 > 0
+    mean, root = rng.normal(size=state.landmarks.shape), rng.normal(size=state.P_mm.shape)
+    mean[:, 3:] = [0, 0, 0, 1]
+    turned = np.broadcast_to(np.diag([1.0, 1, 1, 0, 0, 0, 0]), state.to_coordinates.shape)
+    state = eqx.tree_at(
+        lambda s: (s.track_id, s.is_euclidean, s.landmarks, s.to_coordinates, s.P_mm),
+        state,
+        (ids, is_euclidean, mean, turned, root @ root.T),
+    )
+    expected = []
+    for slot, feature in enumerate(state.track_id):
+        if feature >= 0 and is_euclidean[slot] and not truth.is_moving[feature]:
+            P = state.P_mm[7 * slot : 7 * slot + 3, 7 * slot : 7 * slot + 3]
+            error = mean[slot, :3] - truth.landmarks_m[-1, feature]
+            expected.append(error @ np.linalg.inv(P) @ error)
+    found = float(map_nees(*as_jax((state, truth))))
+    assert 3 < len(expected) < is_euclidean.sum() - 2 and found == pytest.approx(np.mean(expected), rel=1e-9)
+    none = eqx.tree_at(lambda s: s.is_euclidean, state, np.zeros_like(is_euclidean))
+    assert np.isnan(map_nees(*as_jax((none, truth))))

@@ -47,8 +47,8 @@ def test_equals_single_runs_one_after_another():
     runs = strict_runs()
     for seed in range(NUM_SEEDS):
         recording, truth = simulate_once(scenario, jax.random.fold_in(KEY, seed))
-        _, info = run_once(config, recording)
-        single = metrics_of(Experiment(scenario, config), info, truth)
+        state, info = run_once(config, recording)
+        single = metrics_of(Experiment(scenario, config), state, info, truth)
         assert set(single) == set(MEASURES)
         found = runs.isel(seed=seed)
         assert_same_runs(found, single, **ROUNDING)

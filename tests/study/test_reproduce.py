@@ -172,7 +172,7 @@ def test_directory_of_another_key_is_refused_before_any_work(whole, tiny, tables
 def test_directory_of_other_settings_is_refused(whole, tiny, monkeypatch):
     monkeypatch.setattr(module, "GATES", {"RE": vc.ReprojectionError, "VC": lambda: vc.VirtualCorrection(th2=8.0)})
     monkeypatch.setattr(module, "cell_experiment", lambda cell: tiny_experiment(cell_experiment(cell)))
-    with pytest.raises(ValueError, match=r"VC_steady.*has other settings \(config: "):
+    with pytest.raises(ValueError, match=r"VC_steady.*has other settings \(config\."):
         reproduce(whole[0], num_seeds=NUM_SEEDS, tables=(2,))
     assert not tiny
 

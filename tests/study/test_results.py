@@ -17,7 +17,7 @@ import xarray as xr
 
 import vcjax as vc
 from vcjax.study import results
-from vcjax.study.results import SCHEMA, attributes, describe, load, load_attributes, save
+from vcjax.study.results import SCHEMA, attributes, describe, load, load_attributes, refuse_other_settings, save
 from vcjax.study.sweep import Experiment
 
 
@@ -198,6 +198,28 @@ def test_attributes_tell_settings_apart():
     ]
     assert all(other != of() for other in others)
     assert of()["dtype"] == "float64"
+
+
+def test_refusal_of_other_settings_names_the_first_that_differs():
+    """By its path, however long the description; a place in a list where the beginnings look the same."""
+    scenario = tiny_runs.scenario()
+    other_places = np.array(scenario.landmarks_m)
+    other_places[40, 1] += 0.5
+    place = other_places[40, 1]
+    for changed, words in (
+        ({"scenario": dataclasses.replace(scenario, num_frames=14)}, r"\(scenario.num_frames: 12, now 14\)"),
+        ({"scenario": dataclasses.replace(scenario, landmarks_m=other_places)}, rf"landmarks_m.40: .*, now .*{place}"),
+        ({"config": tiny_runs.config(tiny_runs.STRICT)}, r"\(config.gate.th1: 9.0, now 1.0\)"),
+        ({"config": tiny_runs.config(vc.ReprojectionError())}, r"\(config.gate.class: .*Virt.*, now .*Reproj.*\)"),
+    ):
+        was = Experiment(scenario, tiny_runs.config())
+        found, expected = (attributes(each, jax.random.key(0)) for each in (was, dataclasses.replace(was, **changed)))
+        refuse_other_settings("runs.nc", found, found)
+        with pytest.raises(ValueError, match=words) as refused:
+            refuse_other_settings("runs.nc", found, expected)
+        assert len(str(refused.value)) < 220
+    with pytest.raises(ValueError, match=r"key: \[0, 0\], now \[0, 1\]"):
+        refuse_other_settings("runs.nc", attributes(was, jax.random.key(0)), attributes(was, jax.random.key(1)))
 
 
 def test_source_tree_that_is_not_installed_has_an_unknown_version(monkeypatch):

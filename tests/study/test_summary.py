@@ -20,6 +20,7 @@ def tiny_runs() -> xr.Dataset:
             "yaw_error_deg": (frames, [[0.0, 2.0], [1.0, 1.0]]),
             "nees_position": (frames, [[1.0, 3.0], [4.0, 8.0]]),
             "nees_pose": (frames, [[3.0, 3.0], [6.0, 12.0]]),
+            "nees_map": ("seed", [3.0, 6.0]),
             "nis_sum": (frames, [[10.0, 30.0], [8.0, 0.0]]),
             "num_updates": (frames, [[5, 5], [2, 0]]),
             "num_recovered": (frames, [[1, 2], [0, 4]]),
@@ -55,6 +56,7 @@ def test_per_run_equals_numbers_by_hand():
         "detection_delay_frames": [4.0, (1 + 8) / 2],
         "anees_position": [1.0, 3.0],
         "anees_pose": [1.0, 3.0],
+        "anees_map": [1.0, 2.0],
         "nis": [2.0, 2.0],
     }
     figures = per_run(tiny_runs())
@@ -87,7 +89,7 @@ def test_failed_seed_is_counted_and_changes_nothing_else():
     summary, expected = summarise(runs), summarise(runs.isel(seed=[0, 1, 3, 4]))
     assert summary.runs_failed == 1 and expected.runs_failed == 0
     assert summary.num_runs == 5
-    for name in [*FIGURES, "anees_position_bounds", "anees_pose_bounds"]:
+    for name in [*FIGURES, "anees_position_bounds", "anees_pose_bounds", "anees_map_bounds"]:
         np.testing.assert_allclose(summary[name], expected[name], rtol=1e-14)
 
 
@@ -155,7 +157,7 @@ def test_nis_without_updates_is_nan():
     assert np.isnan(per_run(runs).nis).all()
 
 
-@pytest.mark.parametrize(("name", "dof"), [("anees_position", 2), ("anees_pose", 3)])
+@pytest.mark.parametrize(("name", "dof"), [("anees_position", 2), ("anees_pose", 3), ("anees_map", 3)])
 def test_anees_bounds_are_those_of_one_frame_over_the_finite_seeds(name, dof):
     summary = summarise(with_failed_seed(fake_runs(num_seeds=6), 0))
     expected = stats.chi2.ppf([0.025, 0.975], 5 * dof) / (5 * dof)

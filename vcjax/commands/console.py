@@ -13,10 +13,10 @@ def numbered_key(number: int) -> PRNGKeyArray:
     """The random key of a number.
 
     Raises:
-        ValueError: if it has more than 64 bits.
+        ValueError: if it is negative, or has more than 63 bits.
     """
-    if not -(2**63) <= number < 2**63:
-        raise ValueError(f"--key {number}: give a whole number of at most 64 bits.")
+    if not 0 <= number < 2**63:
+        raise ValueError(f"--key {number}: give a whole number from 0 to 2**63 - 1.")
     return jax.random.key(number)
 
 

@@ -26,6 +26,8 @@ from vcjax.tuning.evaluate import stacked
 from vcjax.tuning.intervals import OSCILLATION, Interval
 from vcjax.tuning.losses import camera_motion_m2_s2
 
+_AT_THE_END = 1e-3
+"""Part of an interval that is its end."""
 _PATHS = tuple(path.removeprefix("scenario.") for path in OSCILLATION)
 
 
@@ -40,6 +42,8 @@ class Oscillating(NamedTuple):
     """Mean square speed of the camera, (2πfA)²/2."""
     cost: float
     """What is made small."""
+    at_the_end: tuple[str, ...]
+    """Which of A and f lie at an end of their interval, beyond which nothing was tried."""
 
 
 def best_oscillation(
@@ -82,7 +86,8 @@ def best_oscillation(
     best = min(found, key=lambda result: result.fun)
     (value, (missed, motion)), _ = cost_and_gradient(scenes, test, price, ends, jnp.asarray(best.x))
     A, f = (float(interval.at(p)) for interval, p in zip(ends, best.x, strict=True))
-    return Oscillating(A, f, float(missed), float(motion), float(value))
+    at_the_end = tuple(name for name, part in zip("Af", best.x, strict=True) if min(part, 1 - part) < _AT_THE_END)
+    return Oscillating(A, f, float(missed), float(motion), float(value), at_the_end)
 
 
 @jax.jit

@@ -63,7 +63,8 @@ def survey(
     require_power(test, power)
     for name, values in (("amplitudes_m", amplitudes_m), ("headings_deg", headings_deg), ("speeds_m_s", speeds_m_s)):
         if not len(values) or not np.all(np.isfinite(values)) or (name != "headings_deg" and np.min(values) < 0):
-            raise ValueError(f"survey({name}={tuple(values)}): give at least one number, none negative.")
+            remedy = "finite" if name == "headings_deg" else "finite and none negative"
+            raise ValueError(f"survey({name}={tuple(values)}): give at least one number, {remedy}.")
     places, directions = jnp.asarray(places_m, float), heading(np.asarray(headings_deg))
     speeds = jnp.asarray(speeds_m_s, float)
     found = [

@@ -9,7 +9,16 @@ from typing import Literal
 import equinox as eqx
 import numpy as np
 
-from vcjax.fields import number, require, require_choice, require_count, require_key, require_kind, require_single
+from vcjax.fields import (
+    is_concrete,
+    number,
+    require,
+    require_choice,
+    require_count,
+    require_key,
+    require_kind,
+    require_single,
+)
 from vcjax.filter.follower import Following
 from vcjax.filter.motion_model import AbstractMotion, Odometry
 from vcjax.gates.gate import AbstractDetector, AbstractGate
@@ -92,7 +101,8 @@ class FilterConfig(eqx.Module):
     linearity_max: float = eqx.field(converter=number, default=0.1)
     """Linearity index below which an AHP landmark becomes Euclidean; at least 0 (0: never)."""
     blacklist_frames: float = eqx.field(converter=number, default=np.inf)
-    """For how many frames a deleted feature is kept from being born again; at least 0, infinity: for good."""
+    """For how many frames a deleted feature is kept from being born again; at least 0, infinity: for good. Finite only
+    with a blacklist, and if nothing is followed."""
     birth_margin_px: float = eqx.field(converter=number, default=25.6)
     """Distance from every image border a new feature must keep, px; at least 0."""
 
@@ -130,11 +140,21 @@ class FilterConfig(eqx.Module):
             )
         followings = "give a Following, e.g. vcjax.Following(max_followed=16)."
         require_kind("FilterConfig", "following", self.following, Following, followings)
-        if self.following.max_followed > 0 and self.blacklist_capacity == 0:
+        num_followed, capacity = self.following.max_followed, self.blacklist_capacity
+        if num_followed > capacity:
             raise ValueError(
-                f"FilterConfig(following=Following(max_followed={self.following.max_followed}), blacklist_capacity=0): "
-                "what is followed must stay out of the map; set blacklist_capacity, e.g. 64."
+                f"FilterConfig(following=Following(max_followed={num_followed}), blacklist_capacity={capacity}): "
+                "what is followed must stay out of the map; set blacklist_capacity at least as large, e.g. 64."
             )
+        if is_concrete(self.blacklist_frames) and np.any(np.isfinite(self.blacklist_frames)):
+            given = f"FilterConfig(blacklist_frames={np.asarray(self.blacklist_frames).tolist()}"
+            if capacity == 0:
+                raise ValueError(f"{given}, blacklist_capacity=0) keeps nobody out; set blacklist_capacity, e.g. 64.")
+            if num_followed > 0:
+                raise ValueError(
+                    f"{given}, following=Following(max_followed={num_followed})): a feature would be born again while "
+                    "it is followed; leave blacklist_frames infinite, or follow none."
+                )
         if self.max_updates > self.max_landmarks:
             raise ValueError(
                 f"FilterConfig(max_updates={self.max_updates}) exceeds max_landmarks={self.max_landmarks}: "

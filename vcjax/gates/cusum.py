@@ -7,6 +7,8 @@ landmark that begins to move makes it climb, however long it stood still before.
 
 With θ > 0 such that the mean of exp(θ (RE₁ - κ)) is one, exp(-θ κ) = 1 - 2 θ, a static track of n innovations exceeds h
 with a probability of at most n exp(-θ h): for κ = 4 (θ = 0.398) and h = 20 that is 3.5 in ten thousand per innovation.
+That holds of white innovations, as they are while the filter corrects the landmark with every one. What the gate leaves
+out is met again in the next innovation (see `left_out`), and such tracks exceed the limit more often.
 
 Source: Page 1954, *Continuous inspection schemes*, Biometrika 41.
 """

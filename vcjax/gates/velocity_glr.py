@@ -56,6 +56,9 @@ from vcjax.fields import is_concrete, number, require
 from vcjax.gates.gate import SLOT, AbstractDetector, Evidence, add_at_slots
 from vcjax.gates.left_out import LeftOut, nothing_left_out, whiten_innovations
 
+FALSE_ALARM_RATE = 0.01
+"""Where neither a rate nor a threshold is given."""
+
 
 class Motion(NamedTuple):
     """What is known of a landmark's velocity."""
@@ -78,8 +81,8 @@ class VelocityGLR(AbstractDetector):
     The margin has an exact derivative.
     """
 
-    false_alarm_rate: float = eqx.field(converter=number, default=0.01)
-    """Share of the static tracks that are ever flagged, at most; in (0, 1)."""
+    false_alarm_rate: float | None = eqx.field(converter=number, default=None)
+    """Share of the static tracks that are ever flagged, at most; in (0, 1). None: 0.01, or no rate with a threshold."""
     threshold: float | None = eqx.field(converter=number, default=None)
     """A χ²₃ value instead, the same in all frames; positive."""
     velocity_std_m_s: float = eqx.field(converter=number, default=0.5)
@@ -89,7 +92,14 @@ class VelocityGLR(AbstractDetector):
     the last 1/(1 - forgetting) frames, which has no rate per track and needs a threshold."""
 
     def __check_init__(self):
-        require(self, "false_alarm_rate", lambda a: (a > 0) & (a < 1), "a share of the static tracks lies in (0, 1).")
+        if self.false_alarm_rate is not None and self.threshold is not None:
+            raise ValueError(
+                f"VelocityGLR(false_alarm_rate={self.false_alarm_rate}, threshold={self.threshold}): one replaces the "
+                "other; give one of them, and None for the other."
+            )
+        if self.false_alarm_rate is not None:
+            share = "a share of the static tracks lies in (0, 1)."
+            require(self, "false_alarm_rate", lambda a: (a > 0) & (a < 1), share)
         if self.threshold is not None:
             require(self, "threshold", lambda t: t > 0, "give a positive χ²₃ value (16.3 is 99.9 %), or None.")
         positive = "a standard deviation of velocities is positive and finite."
@@ -135,7 +145,8 @@ class VelocityGLR(AbstractDetector):
         )
         if self.threshold is not None:
             return statistic - self.threshold
-        return statistic - log_det + 2.0 * jnp.log(self.false_alarm_rate)
+        rate = FALSE_ALARM_RATE if self.false_alarm_rate is None else self.false_alarm_rate
+        return statistic - log_det + 2.0 * jnp.log(rate)
 
     def velocity(self, state: Motion) -> tuple[Float[Array, "*L 3"], Float[Array, "*L 3 3"]]:
         """v̂ = (C + I/σ²)⁻¹ d, m/s, and its covariance, m²/s²: along what was not observed 0, and that of the prior."""

@@ -8,7 +8,9 @@ likelihood ratio (the Bayes factor) is
 
 summed along the track. The ratio of a static track, whose innovations are white, is a martingale of mean one, and ever
 exceeds 1/α with a probability of at most α (Ville's inequality): the threshold is 2 ln(1/α), whatever the number of
-frames.
+frames. That holds while the filter corrects the landmark with every innovation. One that the gate leaves out stays an
+error of the state and is met again in the next, which is then not white (see `left_out`): the more is left out, the
+more static tracks are flagged than α says. A wide gate keeps that small.
 
 The velocities of different frames are independent here, so that the sign of an innovation counts for nothing: a slow
 mover that gives many small innovations of one direction, which the GLR adds up, looks static to this one.
@@ -35,7 +37,7 @@ class VelocityLikelihoodRatio(AbstractDetector):
     """
 
     false_alarm_rate: float = eqx.field(converter=number, default=0.01)
-    """α, share of the static tracks that are ever flagged, at most; in (0, 1)."""
+    """α, share of the static tracks that are ever flagged, at most, if the gate leaves nothing out; in (0, 1)."""
     velocity_std_m_s: float = eqx.field(converter=number, default=0.5)
     """σ of each component of the velocity, m/s; positive."""
 

@@ -16,6 +16,7 @@ from vcjax.detectability.survey import SEARCHED_M_S, Prediction, Survey
 from vcjax.report.markup import grid
 from vcjax.report.style import RC, new_figure, write_figure
 from vcjax.storage import write_file, write_json
+from vcjax.tuning.intervals import OSCILLATION
 
 _COLOURS = ("#4d4d4d", "#e69f00", "#009e73", "#0072b2", "#cc79a7", "#d55e00")
 _NEVER, _UNSEEN = "#bdbdbd", "white"
@@ -156,7 +157,19 @@ def markdown(found: Detectability) -> str:
         f"## Movers\n\nSmallest – largest of the {len(found.movers_m)}.\n\n{scenes}\n"
         f"## Best oscillation\n\nFor these scenes, at a price of {told['price']:g} s²/m²: "
         f"A = {best.amplitude_m:.3f} m, f = {best.frequency_hz:.2f} Hz; {1 - best.missed:.3f} of the movers found, "
-        f"camera motion {best.camera_motion_m2_s2:.3f} m²/s².\n"
+        f"camera motion {best.camera_motion_m2_s2:.3f} m²/s².{_ends(best)}\n"
+    )
+
+
+def _ends(best: Oscillating) -> str:
+    """What lies at an end of its interval, in words."""
+    if not best.at_the_end:
+        return ""
+    A, f = OSCILLATION.values()
+    names = " and ".join(best.at_the_end) + (" lies" if len(best.at_the_end) == 1 else " lie")
+    return (
+        f" {names} at an end of what was searched, {A.low:g} to {A.high:g} m and {f.low:g} to {f.high:g} Hz; nothing "
+        "beyond was tried."
     )
 
 
@@ -240,11 +253,14 @@ def _draw_path(axes: Axes, found: Detectability) -> None:
 
 @matplotlib.rc_context(RC)
 def around_figure(found: Detectability) -> Figure:
-    """The smallest speed found at the movers' places against the direction of motion, a line for each amplitude."""
-    places, first = np.unique(found.movers_m[:, :2], axis=0, return_index=True)
-    figure = new_figure(max(2.6 * len(places), 4.0), 3.2)
-    panels = figure.subplots(1, len(places), squeeze=False, sharey=True)[0]
-    for axes, place, number in zip(panels, places, first, strict=True):
+    """The smallest speed found at the movers' places against the direction of motion, a line for each amplitude.
+
+    Of places above each other the first is shown, and its height told.
+    """
+    first = np.unique(found.movers_m[:, :2], axis=0, return_index=True)[1]
+    figure = new_figure(max(2.6 * len(first), 4.0), 3.2)
+    panels = figure.subplots(1, len(first), squeeze=False, sharey=True)[0]
+    for axes, number in zip(panels, first, strict=True):
         for i, amplitude in enumerate(found.amplitudes_m):
             speed, style = found.around.smallest_m_s[i, number], {"color": _COLOURS[i % len(_COLOURS)]}
             is_none = np.isinf(speed)
@@ -256,7 +272,7 @@ def around_figure(found: Detectability) -> Figure:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.xaxis.set_major_locator(MultipleLocator(90))
-        axes.set_title(f"from ({place[0]:g}, {place[1]:g}) m")
+        axes.set_title("from ({:g}, {:g}, {:g}) m".format(*found.movers_m[number]))
         axes.set_xlabel("direction, deg (0: +x)")
     panels[0].set_ylabel("smallest speed found, m/s")
     handles, labels = panels[0].get_legend_handles_labels()

@@ -7,9 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vcjax.report.style import METHOD_COLOURS, RC, new_figure
-
-_MARKERS = "osD^vPX*h"
+from vcjax.report.style import METHOD_STYLES, RC, new_figure
 
 
 @matplotlib.rc_context(RC)
@@ -59,17 +57,11 @@ def _panels(tables: dict[str, Any], label: str, draw) -> Figure:
                     for cell in cells
                     if (cell["dynamic_motion"], cell["amplitude_m"], cell["detector"]) == (motion, amplitude, method)
                 ]
-                style = {
-                    "color": METHOD_COLOURS[i],
-                    "marker": _MARKERS[i],
-                    "markersize": 4,
-                    "capsize": 2,
-                    "label": method,
-                }
+                style = METHOD_STYLES[method] | {"markersize": 4, "capsize": 2, "linewidth": 1.2, "label": method}
                 # Side by side, so that equal values are seen.
                 beside = 0.07 * (i - (len(methods) - 1) / 2)
                 at = np.array([place[cell["dynamic_speed_m_s"]] + beside for cell in chosen])
-                draw(axes, at, chosen, style | {"linewidth": 1.2, "label": method})
+                draw(axes, at, chosen, style)
             camera = f"A = {amplitude:g} m" if amplitude else "steady"
             axes.set_title(f"{motion.replace('_', ' ')}, {camera}")
             axes.set_xticks(range(len(place)), [f"{speed:g}" for speed in place])

@@ -13,7 +13,8 @@ from vcjax.detectability.velocity_test import VelocityTest
 from vcjax.gates.velocity_glr import VelocityGLR
 from vcjax.report.markup import grid
 from vcjax.report.style import RC, new_figure
-from vcjax.study.detect import METHODS, Runs
+from vcjax.study.detect import Runs
+from vcjax.study.detection_methods import METHODS
 from vcjax.study.detection_scenes import Scene
 
 _HALF = 0.5
@@ -38,7 +39,7 @@ def predictions(runs: Runs) -> dict[tuple[str, Scene], dict[str, float]]:
     """
     result = {}
     for (method, scene), found in runs.items():
-        detector = METHODS[method].detector
+        detector = METHODS[method].config.detector
         if not isinstance(detector, VelocityGLR) or detector.threshold is None:
             continue
         if scene.is_static or scene.harder is not None:

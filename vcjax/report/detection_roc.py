@@ -1,83 +1,112 @@
-"""ROC and precision–recall curves of methods over the tracks of all scenes with movers, for each amplitude."""
+"""ROC and precision–recall curves of methods over their thresholds, for each amplitude: tables and figures."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vcjax.report.detection_curves import draw_curve, precision_axes, roc_axes
-from vcjax.report.style import METHOD_COLOURS, RC, new_figure
-from vcjax.study import roc
-from vcjax.study.detect import Runs
-from vcjax.tuning.choice import FALSE_RATE
+from vcjax.report.markup import grid
+from vcjax.report.style import METHOD_STYLES, RC, new_figure
+from vcjax.study.operating_curves import Curves, operating_point
 
-_RESAMPLES = 200
-
-
-def _tracks(runs: Any) -> roc.Tracks:
-    """The tracks of one method in one scene, by what deletes them (see `roc.track_scores`)."""
-    score = roc.track_scores(runs).transpose("seed", "feature")
-    return roc.Tracks(score.values, np.broadcast_to(runs.is_moving.values, score.shape))
+_INTRODUCTION = """\
+Each line is of runs at that threshold, all scenes with movers together but the harder ones: static features flagged of
+those ever mapped, movers found of those ever mapped, and movers among all that was flagged, with 95 % intervals by
+bootstrap over seeds.
+"""
+_RESOLVED = 1e-3
+"""Share of the static features above which the axis is logarithmic; below, down to none, it is linear."""
 
 
-def separation(runs: Any) -> dict[str, dict[str, float]]:
-    """How well a method tells movers from static tracks in a scene, at all thresholds of its score.
+def curves_table(curves: Curves) -> list[dict[str, Any]]:
+    """A line for each method and amplitude: `detector`, `amplitude_m` and `points`, in the order of the thresholds.
 
-    Returns: `auc`, and `recall_at_1_percent`, the share of movers found when 1 % of the static tracks are called
-        dynamic; each with the 95 % interval `lower` to `upper` by bootstrap over seeds.
+    Each point has its `threshold` and what `operating_point` gives.
     """
-    tracks = _tracks(runs)
-    weights = roc.resamples(len(tracks.score), _RESAMPLES)
-    rate = np.array([FALSE_RATE])
-    return {
-        "auc": _with_interval(roc.area(tracks)[0], roc.area(tracks, weights)),
-        "recall_at_1_percent": _with_interval(
-            roc.recall_at(tracks, rate)[0, 0], roc.recall_at(tracks, rate, weights)[:, 0]
-        ),
-    }
+    return [
+        {
+            "detector": method,
+            "amplitude_m": amplitude,
+            "points": [{"threshold": value} | operating_point(counts) for value, counts in points.items()],
+        }
+        for (method, amplitude), points in curves.items()
+    ]
 
 
-def _with_interval(value: float, resampled: np.ndarray) -> dict[str, float]:
-    lower, upper = roc.interval(resampled)
-    return {"mean": float(value), "lower": float(lower), "upper": float(upper)}
+def curves_markdown(table: Sequence[Mapping[str, Any]]) -> str:
+    """The same as Markdown."""
+    header = ("camera", "method", "threshold", "static flagged, %", "movers found, %", "precision, %")
+    rows = [
+        [
+            _camera(amplitude),
+            line["detector"],
+            f"{point['threshold']:g}",
+            _text(point["static_flagged_fraction"], 2),
+            _text(point["found_of_mapped_fraction"], 1),
+            _text(point["precision"], 1),
+        ]
+        for amplitude in dict.fromkeys(line["amplitude_m"] for line in table)
+        for line in table
+        if line["amplitude_m"] == amplitude
+        for point in line["points"]
+    ]
+    return _INTRODUCTION + "\n" + grid(header, rows)
 
 
 @matplotlib.rc_context(RC)
-def roc_figure(runs: Runs) -> Figure:
-    """Both curves with pointwise 95 % bands by bootstrap over seeds, a row for each amplitude, a line for each method.
-
-    The tracks of the scenes with movers are pooled, the harder scenes left out.
-    """
-    pooled = _pooled(runs)
-    amplitudes = list(dict.fromkeys(amplitude for amplitude, _ in pooled))
-    methods = list(dict.fromkeys(method for _, method in pooled))
-    figure = new_figure(7.2, 2.5 * len(amplitudes) + 0.7)
-    panels = figure.subplots(len(amplitudes), 2, squeeze=False)
-    for (left, right), amplitude in zip(panels, amplitudes, strict=True):
-        for method, colour in zip(methods, METHOD_COLOURS, strict=False):
-            if (tracks := pooled.get((amplitude, method))) is not None:
-                style = {"color": colour, "linewidth": 1.2}
-                draw_curve(left, roc.FALSE_RATES, roc.recall_at, tracks, method, style)
-                draw_curve(right, roc.RECALLS, roc.precision_at, tracks, method, style)
-        roc_axes(left)
-        precision_axes(right)
-        for axes in (left, right):
-            axes.set_title(f"A = {amplitude:g} m" if amplitude else "steady")
-    handles, names = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=min(4, len(names)))
-    figure.suptitle("Tracks of all scenes with movers, at every threshold, 95 % bands", fontsize=10)
+def roc_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
+    """Movers found over static features flagged, a panel for each amplitude, a line for each method."""
+    figure, panels = _panels(table, "static_flagged_fraction", "found_of_mapped_fraction")
+    for axes in panels:
+        axes.set_xscale("symlog", linthresh=_RESOLVED)
+        axes.set(xlim=(-_RESOLVED / 10, 1), xlabel="static features flagged")
+    panels[0].set_ylabel("movers found")
     return figure
 
 
-def _pooled(runs: Runs) -> Mapping[tuple[float, str], roc.Tracks]:
-    """The tracks of each amplitude and method; those of one seed in all scenes belong together."""
-    parts: dict[tuple[float, str], list[roc.Tracks]] = {}
-    for (method, scene), found in runs.items():
-        if scene.dynamic_motion is not None:
-            parts.setdefault((scene.amplitude_m, method), []).append(_tracks(found))
-    return {
-        key: roc.Tracks(*(np.concatenate([part[i] for part in each], axis=1) for i in (0, 1)))
-        for key, each in parts.items()
-    }
+@matplotlib.rc_context(RC)
+def precision_figure(table: Sequence[Mapping[str, Any]]) -> Figure:
+    """Movers among what was flagged over movers found, a panel for each amplitude, a line for each method."""
+    figure, panels = _panels(table, "found_of_mapped_fraction", "precision")
+    for axes in panels:
+        axes.set(xlim=(0, 1.02), xlabel="recall: movers found")
+    panels[0].set_ylabel("precision")
+    return figure
+
+
+def _panels(table: Sequence[Mapping[str, Any]], across: str, up: str) -> tuple[Figure, list[Axes]]:
+    """One figure over another: points joined in the order of the thresholds, 95 % bands upward and whiskers across."""
+    amplitudes = list(dict.fromkeys(line["amplitude_m"] for line in table))
+    figure = new_figure(max(2.9 * len(amplitudes), 4.6) + 0.6, 3.9)
+    panels = list(figure.subplots(1, len(amplitudes), squeeze=False, sharey=True).flat)
+    for axes, amplitude in zip(panels, amplitudes, strict=True):
+        for line in (line for line in table if line["amplitude_m"] == amplitude):
+            x, y = (_values(line, name) for name in (across, up))
+            style = METHOD_STYLES[line["detector"]] | {"markersize": 4, "linewidth": 1.2, "label": line["detector"]}
+            axes.fill_between(x[0], y[1], y[2], color=style["color"], alpha=0.15, linewidth=0)
+            axes.errorbar(x[0], y[0], xerr=np.abs(x[1:] - x[0]), **style)
+        axes.set_ylim(0, 1.02)
+        axes.set_title(_camera(amplitude))
+    handles, names = panels[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=min(3, len(names)))
+    figure.suptitle("All scenes with movers, a run for each threshold, 95 % intervals", fontsize=10)
+    return figure, panels
+
+
+def _values(line: Mapping[str, Any], name: str) -> np.ndarray:
+    """Mean, lower and upper bound of a share at each threshold."""
+    return np.array([[point[name][part] for point in line["points"]] for part in ("mean", "lower", "upper")])
+
+
+def _camera(amplitude_m: float) -> str:
+    return f"A = {amplitude_m:g} m" if amplitude_m else "steady"
+
+
+def _text(share: Mapping[str, float], decimals: int) -> str:
+    mean, lower, upper = (f"{100 * share[part]:.{decimals}f}" for part in ("mean", "lower", "upper"))
+    if not np.isfinite(share["mean"]):
+        return "–"
+    return mean if not np.isfinite(share["lower"]) else f"{mean} [{lower}, {upper}]"

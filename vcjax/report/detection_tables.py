@@ -7,13 +7,15 @@ from typing import Any
 
 from vcjax.report.detection_figures import found_figure, position_figure
 from vcjax.report.detection_prediction import prediction_figure, prediction_markdown, predictions
-from vcjax.report.detection_roc import roc_figure, separation
+from vcjax.report.detection_roc import curves_markdown, curves_table, precision_figure, roc_figure
 from vcjax.report.markup import grid
 from vcjax.report.style import write_figure
 from vcjax.storage import write_file, write_json
-from vcjax.study.detect import METHODS, MIN_FRAMES_MAPPED, Runs, scores
+from vcjax.study.detect import Detection
+from vcjax.study.detection_methods import METHODS
+from vcjax.study.detection_scores import MIN_FRAMES_MAPPED, scores
 from vcjax.study.results import describe
-from vcjax.study.summary import paired_difference
+from vcjax.study.summary import DEGREES_OF_FREEDOM, paired_difference
 
 DIFFERENCES = ("position_rmse_cm", "orientation_error_deg")
 """Figures that are compared with the static scene's, seed by seed."""
@@ -21,44 +23,48 @@ _HEADER = (
     "scene",
     "method",
     "movers found, %",
+    "… of all mapped, %",
+    "… in a run",
     "static flagged, %",
     "delay, frames",
-    "AUC",
-    "recall at 1 %, %",
     "velocity error, m/s",
     "position, cm",
     "against the static scene, cm",
     "ratio",
-    "ANEES",
+    "ANEES position",
+    "ANEES pose",
+    "ANEES map",
 )
 _INTRODUCTION = f"""\
 *Movers found*: unique movers flagged of those in the map for at least {MIN_FRAMES_MAPPED} frames or flagged, features
-of all runs pooled, and how many; *static flagged*: static features ever flagged of those ever mapped; *delay*: frames
-from first birth to first deletion of the movers found; *AUC*, *recall at 1 %*: how well the largest margin that a track
-ever had tells movers from static tracks at all thresholds, and the share of movers found where 1 % of the static tracks
-are called dynamic, with 95 % intervals by bootstrap over seeds; *velocity error*: |v̂ − v| of movers when they were
-flagged, of methods that estimate it, and in brackets its NEES / 3; *position*: RMS error of a run; *against the static
-scene*: the difference of it from the same seeds without movers, with its 95 % interval, bold where that excludes zero;
-*ratio*: of the two errors; *ANEES*: of the position, 1 of a consistent filter. ± is a standard error over runs, which
-is 0 where all runs agree. The features that are flagged are those that gate or detector has ever deleted.
+of all runs pooled, and how many: what was mapped for less counts here if it was found and not if it was missed, which
+flatters; *of all mapped*: of all movers ever in the map; *in a run*: how many unique movers, which needs no
+denominator; *static flagged*: static features ever flagged of those ever mapped; *delay*: frames from first birth to
+first deletion of the movers found; *velocity error*: |v̂ − v| of movers when they were flagged, of methods that estimate
+it, and in brackets its NEES / 3; *position*: RMS error of a run; *against the static scene*: the difference of it from
+the same seeds without movers, with its 95 % interval, bold where that excludes zero; *ratio*: of the two errors;
+*ANEES*: of position, pose and the places of the map's static landmarks, 1 of a consistent filter, bold outside the
+bounds in which 95 % of averages over so many runs lie. ± is a standard error over runs, which is 0 where all runs
+agree. The features that are flagged are those that gate or detector has ever deleted.
 """
 
 
-def detection_tables(runs: Runs) -> dict[str, Any]:
+def detection_tables(found: Detection) -> dict[str, Any]:
     """Scores of every method in every scene as plain values.
 
     Args:
-        runs: what `study.detect` gives.
+        found: what `study.detect` gives.
 
     Returns: `cells` with movers and `static_cells` without, each with `detector`, `robot_motion`, `dynamic_motion`,
         `dynamic_speed_m_s`, `amplitude_m` and the `study.detect.scores`. Those with movers have the static scene's
         `static_scene_position_rmse_cm`, and `difference`: by figure of `DIFFERENCES` the `mean` of scene - static scene
         of the same seeds, its 95 % interval `lower` to `upper` and `num_pairs`. `harder_cells` are like them, with the
-        harder scene's name as `label`. Beside them `methods`, the configuration of each, and `num_seeds`.
+        harder scene's name as `label`. `curves` are the operating curves (see `detection_roc.curves_table`). Beside
+        them `methods`, the configuration of each, and `num_seeds`.
     """
-    cells, harder_cells, static_cells, predicted = [], [], [], predictions(runs)
-    for (method, scene), found in runs.items():
-        static = runs[method, scene.static]
+    cells, harder_cells, static_cells, predicted = [], [], [], predictions(found.runs)
+    for (method, scene), runs in found.runs.items():
+        static = found.runs[method, scene.static]
         cell: dict[str, Any] = {
             "detector": method,
             "robot_motion": scene.robot,
@@ -68,24 +74,25 @@ def detection_tables(runs: Runs) -> dict[str, Any]:
             "label": scene.label,
         }
         if scene.is_static:
-            cell |= scores(found, found)
+            cell |= scores(runs, runs)
             static_cells.append(cell)
             continue
         if scene.dynamic_motion is not None:
             cell["dynamic_set"] = scene.dynamic_set
-        cell |= scores(found, static) | separation(found)
+        cell |= scores(runs, static)
         cell["static_scene_position_rmse_cm"] = scores(static, static)["position_rmse_cm"]
-        cell["difference"] = _difference(found, static)
+        cell["difference"] = _difference(runs, static)
         if (method, scene) in predicted:
             cell["predicted"] = predicted[method, scene]
         (cells if scene.harder is None else harder_cells).append(cell)
     return {
-        "num_seeds": max(int(found.sizes["seed"]) for found in runs.values()),
+        "num_seeds": max(int(runs.sizes["seed"]) for runs in found.runs.values()),
         "min_frames_mapped": MIN_FRAMES_MAPPED,
-        "methods": {name: describe(METHODS[name]) for name in dict.fromkeys(method for method, _ in runs)},
+        "methods": {name: describe(METHODS[name].config) for name in dict.fromkeys(method for method, _ in found.runs)},
         "cells": cells,
         "harder_cells": harder_cells,
         "static_cells": static_cells,
+        "curves": curves_table(found.curves),
     }
 
 
@@ -101,12 +108,14 @@ def detection_markdown(tables: Mapping[str, Any]) -> str:
         cells = [cell for cell in every if cell["amplitude_m"] == amplitude]
         scenes = dict.fromkeys(cell["label"] for cell in cells)
         sections.append(grid(_HEADER, [_row(cell) for scene in scenes for cell in cells if cell["label"] == scene]))
+    if tables["curves"]:
+        sections += ["## At other thresholds\n", curves_markdown(tables["curves"])]
     if predicted := [cell for cell in every if "predicted" in cell]:
         sections += ["## Predicted before anything was run\n", prediction_markdown(predicted)]
     return "\n".join(sections)
 
 
-def write_detection(runs: Runs, directory: Path) -> list[Path]:
+def write_detection(found: Detection, directory: Path) -> list[Path]:
     """Write `detect.json`, `detect.md` and the figures into a directory.
 
     Returns: the paths written.
@@ -114,7 +123,7 @@ def write_detection(runs: Runs, directory: Path) -> list[Path]:
     Raises:
         OSError: if the directory cannot be written to.
     """
-    tables = detection_tables(runs)
+    tables = detection_tables(found)
     paths = [write_json(directory / "detect.json", tables)]
     paths.append(write_file(directory / "detect.md", detection_markdown(tables).encode()))
     for dynamic_set in dict.fromkeys(cell["dynamic_set"] for cell in tables["cells"]):
@@ -122,8 +131,9 @@ def write_detection(runs: Runs, directory: Path) -> list[Path]:
         name = "" if dynamic_set == "ahead" else f"_{dynamic_set}"
         paths += write_figure(found_figure(tables | {"cells": chosen}), directory / "figures" / f"movers_found{name}")
         paths += write_figure(position_figure(tables | {"cells": chosen}), directory / "figures" / f"position{name}")
-    if tables["cells"]:
-        paths += write_figure(roc_figure(runs), directory / "figures" / "roc")
+    if curves := tables["curves"]:
+        paths += write_figure(roc_figure(curves), directory / "figures" / "roc")
+        paths += write_figure(precision_figure(curves), directory / "figures" / "precision_recall")
     if predicted := [cell for cell in [*tables["cells"], *tables["harder_cells"]] if "predicted" in cell]:
         paths += write_figure(prediction_figure(predicted), directory / "figures" / "predicted")
     return paths
@@ -148,15 +158,15 @@ def _row(cell: Mapping[str, Any]) -> list[str]:
         cell["label"],
         cell["detector"],
         found,
+        _text(cell["found_of_mapped_fraction"], 1, 100),
+        _text(cell["found_per_run"], 2),
         _text(cell["static_flagged_fraction"], 2, 100),
         _text(cell["delay_frames"], 1),
-        _separation(cell, "auc", "{:.3f}", 1),
-        _separation(cell, "recall_at_1_percent", "{:.0f}", 100),
         _velocity(cell),
         _text(cell["position_rmse_cm"], 2),
         "–" if difference is None else _interval(difference),
         "–" if difference is None else _text(cell["position_ratio"], 2),
-        _text(cell["anees_position"], 2),
+        *(_anees(cell, name) for name in DEGREES_OF_FREEDOM),
     ]
 
 
@@ -168,11 +178,10 @@ def _text(figure: Mapping[str, float], decimals: int, factor: float = 1.0) -> st
     return f"{mean:.{decimals}f}" + (f" ± {error:.{decimals}f}" if math.isfinite(error) else "")
 
 
-def _separation(cell: Mapping[str, Any], name: str, form: str, factor: float) -> str:
-    if name not in cell or not math.isfinite(cell[name]["mean"]):
-        return "–"
-    mean, lower, upper = (form.format(factor * cell[name][part]) for part in ("mean", "lower", "upper"))
-    return f"{mean} [{lower}, {upper}]"
+def _anees(cell: Mapping[str, Any], name: str) -> str:
+    text, bounds = _text(cell[name], 2), cell["anees_bounds"][name]
+    is_outside = not bounds["lower"] <= cell[name]["mean"] <= bounds["upper"]
+    return f"**{text}**" if is_outside and math.isfinite(cell[name]["mean"]) else text
 
 
 def _velocity(cell: Mapping[str, Any]) -> str:

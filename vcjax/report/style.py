@@ -28,8 +28,21 @@ RC: Any = {
     "svg.fonttype": "path",
 }
 """Matplotlib's settings."""
-METHOD_COLOURS = ("#000000", "#e69f00", "#009e73", "#0072b2", "#d55e00", "#cc79a7", "#56b4e9", "#8c8c00", "#7f3c8d")
-"""Of the methods of a comparison, in their order."""
+METHOD_STYLES: dict[str, dict[str, Any]] = {
+    "VC": {"color": "#000000", "marker": "o"},
+    "RE": {"color": "#e69f00", "marker": "s"},
+    "one_point_ransac": {"color": "#009e73", "marker": "D"},
+    "VC+blacklist": {"color": "#7a7a7a", "marker": "o", "linestyle": "--"},
+    "RE+blacklist": {"color": "#b87333", "marker": "s", "linestyle": "--"},
+    "one_point_ransac+blacklist": {"color": "#66c2a5", "marker": "D", "linestyle": "--"},
+    "RE+velocity_glr": {"color": "#0072b2", "marker": "^"},
+    "VC+velocity_glr": {"color": "#d55e00", "marker": "v"},
+    "RE+velocity_likelihood_ratio": {"color": "#cc79a7", "marker": "P"},
+    "RE+windowed_nis": {"color": "#56b4e9", "marker": "X"},
+    "RE+cusum": {"color": "#8c8c00", "marker": "*"},
+    "RE+immediate": {"color": "#7f3c8d", "marker": "h"},
+}
+"""Of the methods that `vcjax detect` compares: the same in every figure, whichever are in it."""
 _METADATA = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}}
 
 

@@ -13,7 +13,8 @@ def detections(info: FrameInfo, truth: Truth) -> dict[str, Array]:
     `dynamic_margin` is the largest of all frames (see `FrameInfo`), NaN of a feature that was never a measured
     candidate: a score by which features can be ranked, and above 0 where the gate has called it dynamic.
     `detector_margin` is the same of the detector's, NaN where it never had anything to say, and above 0 where it has
-    deleted the feature. Frames count from 1; `first_mapped` and `first_deleted` are 0 where that never happened.
+    deleted the feature: if for good, the score ends there (see `roc`). Frames count from 1; `first_mapped` and
+    `first_deleted` are 0 where that never happened.
     """
     num_features, is_moving = truth.is_moving.shape[0], jnp.asarray(truth.is_moving)
     dynamic_id = jnp.where(info.is_dynamic, info.candidate_id, -1)

@@ -8,15 +8,18 @@ from jaxtyping import Array, Float
 
 from vcjax.ekf import mahalanobis
 from vcjax.filter.info import FrameInfo
+from vcjax.filter.landmark_points import landmark_points
+from vcjax.filter.state import FilterState
 from vcjax.models.frames import quaternion_conjugate, quaternion_product, yaw_from_quaternion
 from vcjax.recording import Truth
 from vcjax.study.detection import detections
 
 
-def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
+def run_metrics(state: FilterState, info: FrameInfo, truth: Truth) -> dict[str, Array]:
     """All that is kept of a run: per frame (T,) or per feature (F,), under the names of the results.
 
-    Errors are not aligned: estimate and truth start from the same known pose. Derivatives are exact where continuous.
+    `state` is the last. Errors are not aligned: estimate and truth start from the same known pose. Derivatives are
+    exact where continuous.
     """
     return {
         **trajectory_errors(info, truth),
@@ -29,6 +32,7 @@ def run_metrics(info: FrameInfo, truth: Truth) -> dict[str, Array]:
         "num_landmarks": jnp.sum(info.track_id >= 0, axis=1),
         "num_coordinates": info.num_coordinates,
         **detections(info, truth),
+        "nees_map": map_nees(state, truth),
         "is_finite": jnp.all(info.is_finite),
         "map_full_frames": jnp.sum(info.map_is_full),
         "robot": info.vehicle[:, :7],
@@ -65,8 +69,24 @@ def trajectory_errors(info: FrameInfo, truth: Truth) -> dict[str, Float[Array, "
     }
 
 
+def map_nees(state: FilterState, truth: Truth) -> Float[Array, ""]:
+    """Normalised error squared of a landmark's place in the last frame, 3 degrees of freedom, in the mean over the map.
+
+    eᵀ P⁻¹ e with the error e of its place. Of the static landmarks that have become Euclidean alone: one whose inverse
+    depth is badly known has no place with a Gaussian error that a covariance could describe, and the anchor and
+    direction of its own parameters have no truth to be compared with. NaN where there is none.
+    """
+    points = landmark_points(state, state.is_euclidean)
+    is_there = (points.track_id >= 0) & ~jnp.asarray(truth.is_moving)[points.track_id]
+    error = points.place_m - jnp.asarray(truth.landmarks_m)[-1, points.track_id]
+    harmless = jnp.where(is_there[:, None, None], points.cov, jnp.eye(3, dtype=points.cov.dtype))
+    num = jnp.sum(is_there)
+    total = jnp.sum(jnp.where(is_there, _normalised_square(jnp.where(is_there[:, None], error, 0.0), harmless), 0.0))
+    return jnp.where(num > 0, total / jnp.where(num > 0, num, 1), jnp.nan)
+
+
 def _normalised_square(error: Float[Array, "T n"], cov: Float[Array, "T n n"]) -> Float[Array, " T"]:
-    """eᵀ P⁻¹ e of each frame."""
+    """eᵀ P⁻¹ e of each."""
     return jnp.sum(error * jnp.linalg.solve(cov, error[..., None])[..., 0], axis=1)
 
 

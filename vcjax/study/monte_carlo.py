@@ -23,6 +23,7 @@ from vcjax.fields import require_key, require_kind, require_single
 from vcjax.filter.config import FilterConfig, check_arguments
 from vcjax.filter.info import FrameInfo
 from vcjax.filter.run import run
+from vcjax.filter.state import FilterState
 from vcjax.recording import Truth
 from vcjax.simulation.scenarios import Scenario
 from vcjax.simulation.simulate import simulate
@@ -191,16 +192,15 @@ def run_one(experiment: Experiment, key: PRNGKeyArray) -> dict[str, Array]:
     return metrics_of(experiment, *simulate_and_filter(experiment, key))
 
 
-def metrics_of(experiment: Experiment, info: FrameInfo, truth: Truth) -> dict[str, Array]:
-    """All that is kept of a run, under the names of the results."""
+def metrics_of(experiment: Experiment, state: FilterState, info: FrameInfo, truth: Truth) -> dict[str, Array]:
+    """All that is kept of a run, of which `state` is the last, under the names of the results."""
     rate = experiment.scenario.frame_rate_hz
-    return run_metrics(info, truth) | velocity_errors(experiment.config.detector, info, truth, rate)
+    return run_metrics(state, info, truth) | velocity_errors(experiment.config.detector, info, truth, rate)
 
 
-def simulate_and_filter(experiment: Experiment, key: PRNGKeyArray) -> tuple[FrameInfo, Truth]:
-    """One run, with every frame's info and the truth beside it. Pure."""
+def simulate_and_filter(experiment: Experiment, key: PRNGKeyArray) -> tuple[FilterState, FrameInfo, Truth]:
+    """One run: the last state, every frame's info, and the truth beside it. Pure."""
     recording, truth = simulate(experiment.scenario, key)
     # Births in random order draw from a key of their own; `simulate` splits the key, which uses up its folds 0 and 1.
     birth_key = jax.random.fold_in(key, 2) if experiment.config.birth_order == "random" else None
-    _, info = run(experiment.config, recording, birth_key)
-    return info, truth
+    return *run(experiment.config, recording, birth_key), truth

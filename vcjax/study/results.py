@@ -54,6 +54,8 @@ PER_FEATURE = {
     "velocity_nees": "the same, normalised and squared, 3 degrees of freedom",
 }
 PER_RUN = {
+    "nees_map": "normalised error squared of the places of static Euclidean landmarks in the last frame, 3 degrees of "
+    "freedom, mean over them; NaN: none",
     "is_finite": "whether all numbers of the run stayed finite",
     "detection_auc": "share of pairs of a mover and another feature that dynamic_margin puts in the right order",
     "detector_auc": "share of pairs of a mover and another feature that detector_margin puts in the right order",
@@ -142,10 +144,33 @@ def refuse_other_settings(path: str | os.PathLike, found: Mapping[str, Any], exp
     """
     for name, value in expected.items():
         if found.get(name) != value:
+            place, one, other = _first_difference(name, found.get(name), value)
             raise ValueError(
-                f"{path} has other settings ({name}: {_short(found.get(name))}, now {_short(value)}); "
+                f"{path} has other settings ({place}: {_short(one)}, now {_short(other)}); "
                 "give another directory, or remove this one."
             )
+
+
+def _first_difference(name: str, found: Any, expected: Any) -> tuple[str, Any, Any]:
+    """The first part in which two descriptions differ: its path, and what each has there."""
+    one, other = _parsed(found), _parsed(expected)
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        parts = [(key, one.get(key), other.get(key)) for key in {**other, **one}]
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other) and _short(one) == _short(other):
+        parts = list(zip(range(len(one)), one, other, strict=True))
+    else:
+        parts = []
+    differing = ((f"{name}.{key}", *pair) for key, *pair in parts if pair[0] != pair[1])
+    place = next(differing, None)
+    return (name, one, other) if place is None else _first_difference(*place)
+
+
+def _parsed(value: Any) -> Any:
+    """A description kept as text, as it was."""
+    try:
+        return json.loads(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 def _short(value: Any) -> str:

@@ -1,5 +1,9 @@
 """How well tracks are told apart by a score, at every threshold at once: ROC and precision–recall curves.
 
+This holds where a track goes on after it crossed a threshold, as with VC without a blacklist: a feature that was
+deleted is born again and looked at again. Of what is deleted for good the score ends with the first crossing, and tells
+by how much that went too far: what another threshold would do takes another run (`operating_curves`).
+
 A track's score is how dynamic it ever looked to what deletes tracks, gate and detector (`track_scores`). For curves the
 tracks of all runs are pooled: each counts once, with its run's weight. Intervals are by bootstrap over seeds, since
 the tracks of a run depend on each other: a resample draws as many seeds as there are, with replacement, and keeps all
@@ -26,7 +30,8 @@ def track_scores(runs: Any) -> Any:
 
     Both margins are distances to thresholds in χ² units, and either deletes where it is above 0. The margin of a gate
     without verdicts, which leaves out and deletes nothing, does not count; a gate is taken for one if in none of the
-    runs it has deleted anything, though margins were above 0.
+    runs it has deleted anything, though margins were above 0. Of a track deleted for good the score is that of its
+    first crossing, by which such tracks can hardly be ranked among themselves.
 
     Args:
         runs: runs of one filter, an `xarray.Dataset` with the `dynamic_margin`, `detector_margin` and

@@ -29,6 +29,7 @@ FIGURES = {
     "detection_delay_frames": "detection delay, frames",
     "anees_position": "ANEES position (2 dof)",
     "anees_pose": "ANEES pose (3 dof)",
+    "anees_map": "ANEES map (3 dof)",
     "nis": "NIS / 2",
 }
 """Every per-run figure and its label, in the order of print."""
@@ -47,12 +48,14 @@ SOMETIMES_UNDEFINED = (
     "detection_delay_frames",
     "anees_position",
     "anees_pose",
+    "anees_map",
     "nis",
 )
 """Figures that a run need not have (no mover, none found, no covariance to speak of, no update): means are over the
 runs that have them."""
 
-_DOF = {"anees_position": 2, "anees_pose": 3}
+DEGREES_OF_FREEDOM = {"anees_position": 2, "anees_pose": 3, "anees_map": 3}
+"""Of the errors in each ANEES."""
 _CONFIDENCE = 0.95
 _SWEPT = (
     "position_rmse_cm",
@@ -82,11 +85,13 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
     `dynamic_found_per_run` and `static_deleted_per_run` count distinct moving and static features deleted at least
     once. With them, and with as many movers as were measured candidates or deleted, `detection_f1` is
     2 found / (found + static deleted + movers), NaN where nothing moves; `detection_auc` is the area under the ROC of
-    the features' `roc.track_scores`, NaN where no mover was measured, or nothing else. `detection_delay_frames` is the
-    mean over the movers found of the frames from first birth to first deletion.
+    the features' `roc.track_scores`, which says little of other thresholds where what is deleted never comes back, NaN
+    where no mover was measured, or nothing else. `detection_delay_frames` is the mean over the movers found of the
+    frames from first birth to first deletion.
 
     ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter; frames where it is not
-    defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `nis` is the mean squared
+    defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `anees_map` is that of
+    the map in the last frame (see `metrics.map_nees`). `nis` is the mean squared
     Mahalanobis distance of the accepted updates / 2, NaN where there was none; the gate cuts its tail off, so a
     consistent filter has 1 − t·exp(−t) / (1 − exp(−t)) with t = Th₁ / 2, which is 0.95 for Th₁ = 9.
 
@@ -117,8 +122,9 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
                 "detection_f1": (2 * found / np.maximum(called + num_movers, 1)).where(runs.is_moving.any("feature")),
                 "detection_auc": _area(runs),
                 "detection_delay_frames": (runs.first_deleted - runs.first_mapped).where(is_found).mean("feature"),
-                "anees_position": runs.nees_position.mean("frame", skipna=True) / _DOF["anees_position"],
-                "anees_pose": runs.nees_pose.mean("frame", skipna=True) / _DOF["anees_pose"],
+                "anees_position": runs.nees_position.mean("frame", skipna=True) / DEGREES_OF_FREEDOM["anees_position"],
+                "anees_pose": runs.nees_pose.mean("frame", skipna=True) / DEGREES_OF_FREEDOM["anees_pose"],
+                "anees_map": runs.nees_map / DEGREES_OF_FREEDOM["anees_map"],
                 "nis": runs.nis_sum.sum("frame", skipna=False) / num_updates.where(num_updates > 0) / 2,
             }
         )
@@ -146,17 +152,18 @@ def mean_and_error(values: xr.DataArray, counts: xr.DataArray) -> tuple[xr.DataA
 def summarise(runs: xr.Dataset) -> Summary:
     """Mean and standard error over the finite seeds of every figure of `per_run`, with bounds for ANEES.
 
-    The bounds are the two-sided 95 % interval of χ²(n·dof) / (n·dof) for the n finite seeds that have an ANEES: 2 dof
-    for the position (x, y), 3 for the pose (x, y, yaw). The frames of a run are correlated, so they add nothing to the
-    degrees of freedom: the interval is that of one frame's average over seeds, cautious for the mean over frames.
+    The bounds are `anees_bounds` for the n finite seeds that have an ANEES: 2 degrees of freedom for the position
+    (x, y), 3 for the pose (x, y, yaw), and 3 for a landmark's place. The frames of a run are correlated, and so are the
+    landmarks of a map, so they add nothing to the degrees of freedom: the interval is that of one frame's average over
+    seeds, or of one landmark's, cautious for the mean over all.
 
     Args:
         runs: one cell's runs with dimensions (..., seed, frame, feature).
 
     Returns:
         A Dataset that prints as text: every figure as (statistic, ...) with statistic "mean" and "se";
-        `anees_position_bounds` and `anees_pose_bounds` as (bound, ...) with bound "lower" and "upper"; `num_runs`,
-        `runs_failed` and `runs_map_full` (runs in which the map was full in some frame) as counts.
+        `anees_position_bounds`, `anees_pose_bounds` and `anees_map_bounds` as (bound, ...) with bound "lower" and
+        "upper"; `num_runs`, `runs_failed` and `runs_map_full` (runs in which the map was full in some frame) as counts.
 
     References:
         Bar-Shalom, Li, Kirubarajan 2001, *Estimation with Applications to Tracking and Navigation*, section 5.4.
@@ -166,16 +173,21 @@ def summarise(runs: xr.Dataset) -> Summary:
     array = _as_array(figures)
     mean, error = mean_and_error(array, _counts(array, is_finite))
     summary = _statistics({"mean": mean, "se": error})
-    tails = {"lower": (1 - _CONFIDENCE) / 2, "upper": (1 + _CONFIDENCE) / 2}
-    for name, dof in _DOF.items():
+    for name, dof in DEGREES_OF_FREEDOM.items():
         num = (is_finite & figures[name].notnull()).sum("seed")
-        dof_total = dof * num.where(num > 0)
-        bounds = {side: xr.apply_ufunc(stats.chi2.ppf, q, dof_total) / dof_total for side, q in tails.items()}
-        summary[f"{name}_bounds"] = xr.concat(list(bounds.values()), xr.Variable("bound", list(bounds)))
+        bounds = xr.apply_ufunc(anees_bounds, num.where(num > 0), dof, output_core_dims=[[], []])
+        summary[f"{name}_bounds"] = xr.concat(bounds, xr.Variable("bound", ["lower", "upper"]))
     summary["num_runs"] = xr.ones_like(is_finite, dtype=int).sum("seed")
     summary["runs_failed"] = (~is_finite).sum("seed")
     summary["runs_map_full"] = (runs.map_full_frames > 0).sum("seed")
     return Summary(summary.data_vars, summary.coords)
+
+
+def anees_bounds(num: Any, dof: int) -> tuple[Any, Any]:
+    """The central 95 % of an average over `num` independent NEES / dof: quantiles of χ²(n·dof) / (n·dof)."""
+    tail = (1 - _CONFIDENCE) / 2
+    lower, upper = (stats.chi2.ppf(q, num * dof) / (num * dof) for q in (tail, 1 - tail))
+    return lower, upper
 
 
 def paired_difference(runs_a: xr.Dataset, runs_b: xr.Dataset) -> xr.Dataset:

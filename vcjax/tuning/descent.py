@@ -194,7 +194,8 @@ def _value_and_gradient(
         }
         config = eqx.tree_at(lambda c: c.temperature, problem.config, temperature)
         experiment = replace_at(Experiment(scenario, config), values)
-        value = problem.objective(experiment.scenario, *simulate_and_filter(experiment, key))
+        _, info, truth = simulate_and_filter(experiment, key)
+        value = problem.objective(experiment.scenario, info, truth)
         return value, value
 
     derivative = jax.jacrev if problem.config.reverse_mode else jax.jacfwd

@@ -195,7 +195,7 @@ def _run_lane(scenes: Scenario, config: FilterConfig, objective: Objective, lane
     """One run of one setting in one scene."""
     values = {path: value for path, value in lane.items() if path != "scene"}
     experiment = replace_at(Experiment(scene(scenes, lane["scene"]), config), values)
-    info, truth = simulate_and_filter(experiment, key)
+    state, info, truth = simulate_and_filter(experiment, key)
     scenario = experiment.scenario
     costs = {"loss": objective(scenario, info, truth), "camera_motion_m2_s2": camera_motion_m2_s2(scenario)}
-    return metrics_of(experiment, info, truth) | costs
+    return metrics_of(experiment, state, info, truth) | costs
