@@ -22,7 +22,6 @@ from jaxtyping import Array, Bool, Float
 
 from vcjax.fields import is_concrete, number, require
 from vcjax.filter.info import FrameInfo
-from vcjax.gates.surrogates import straight_through
 from vcjax.recording import Truth
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study.detection import happened, largest_by_feature
@@ -55,9 +54,7 @@ def tracks(info: FrameInfo, truth: Truth) -> Labelled:
     is_deleted = happened(info.inconsistent_id, num_features)
     by_detector = jnp.nan_to_num(largest_by_feature(info.watched_id, info.p_detector, num_features))
     place = jnp.where(each.counts, info.candidate_id, num_features).ravel()
-    p_not = 1.0 - each.p
-    # The derivative of the product by a factor that is zero is the product of the others: it passes the cut-off.
-    log_not = jnp.log(straight_through(jnp.maximum(p_not, _CLOSEST), p_not)).ravel()
+    log_not = jnp.log(jnp.maximum(1.0 - each.p, _CLOSEST)).ravel()
     total = jnp.zeros(num_features, log_not.dtype).at[place].add(log_not, mode="drop")
     counts = is_deleted | happened(jnp.where(each.counts, info.candidate_id, -1), num_features)
     p = jnp.where(counts, 1.0 - (1.0 - by_detector) * jnp.exp(total), 0.0)
