@@ -78,8 +78,8 @@ def test_another_run_is_refused_and_damage_is_said(tmp_path):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ValueError, match=r"unfinished has other settings \(config\..*give another directory"):
         run(folder, gate=vc.VirtualCorrection(th1=5.0))
-    with pytest.raises(ValueError, match=r"unfinished has other settings \(config: .*give another directory"):
-        run(folder, blacklist_frames=50.0)
+    with pytest.raises(ValueError, match=r"unfinished has other settings \(config.*give another directory"):
+        run(folder, blacklist_frames=50.0, blacklist_capacity=8)
     recording = recorded.content().recording
     uv_px = np.array(recording.uv_px)
     uv_px[3, 2] += 0.25
