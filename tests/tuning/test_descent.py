@@ -236,3 +236,24 @@ def test_an_end_may_be_the_last_number_that_is_valid():
 def test_the_numbers_of_the_paper_are_inside():
     assert all(np.isfinite(interval.to_free(9.0)) for interval in THRESHOLDS.values())
     assert np.isfinite(OSCILLATION[A].to_free(0.05)) and np.isfinite(OSCILLATION[F].to_free(3.0))
+
+
+def test_a_step_too_far_ends_inside():
+    """However long a step, its parameter stays inside the interval, where it can be gone on from."""
+    nothing = dict.fromkeys(PARAMETERS, 0.0)
+    here = PROBLEM.to_parameters(PROBLEM.to_free(START))
+    step = module.Step(here, 1.0, 0.5, 0.1, dict.fromkeys(PARAMETERS, 1.0), dict.fromkeys(PARAMETERS, 0.1), nothing, 0)
+    optimiser = Schedule(learning_rate=1e9).optimiser()
+    free = PROBLEM.to_free(START)
+    free, _ = module._move(optimiser, free, optimiser.init(jnp.asarray(free)), step)
+    there = PROBLEM.to_parameters(free)
+    np.testing.assert_allclose(PROBLEM.to_free(there), free, rtol=1e-6)
+    assert there[TH1] < 0.21 and end_of(PROBLEM, [step._replace(parameters=there)]) == pytest.approx(there)
+
+
+def test_losses_without_a_derivative_of_hard_decisions_are_refused():
+    hard = dataclasses.replace(SOFT, smoothing="straight_through")
+    for name in ("track_cross_entropy", "track_ranking", "candidate_cross_entropy"):
+        with pytest.raises(ValueError, match=rf"objective.{name}=0.5\): of hard decisions"):
+            problem_of(SCENES, hard, PARAMETERS, Objective(**{name: 0.5}))
+    problem_of(SCENES, hard, PARAMETERS, OBJECTIVE)

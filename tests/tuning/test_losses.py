@@ -209,3 +209,25 @@ def test_what_a_mover_counts_and_the_temperature_of_the_order_are_the_objectives
 def test_bad_objectives_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         Objective(**fields)
+
+
+def test_a_degree_of_one_pulls_as_the_others_let_it(unchecked):
+    """∂/∂p of 1 - Π (1 - p) is the product of the others, at p = 1 as well, where hard decisions are."""
+    degrees = np.array([[0.0, 0.3, 1.0, 0.0], [0.2, 0, 0, 0], [0.0, 1.0, 0.5, 1.0]])
+    slope = jax.jacrev(lambda p: tracks(info(p), truth()).p.sum())(jnp.asarray(degrees))
+    expected = np.zeros_like(degrees)
+    counted = IS_MEASURED & (IDS >= 0)
+    for t, k in np.argwhere(counted):
+        others = counted & (IDS[t, k] == IDS)
+        others[t, k] = False
+        expected[t, k] = np.prod(1 - degrees[others])
+    np.testing.assert_allclose(slope, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_losses_are_finite_where_degrees_are_0_and_1(dtype):
+    """1 - 1e-9 is 1 in single precision: it must not be what a degree is compared with."""
+    labelled = Labelled(jnp.array([0, 1, 1, 0], dtype), jnp.array([True, True, False, False]), jnp.ones(4, bool))
+    for loss in (f1_loss, cross_entropy, ranking_loss):
+        value, slope = jax.value_and_grad(lambda p, loss=loss: loss(labelled._replace(p=p)))(labelled.p)
+        assert slope.dtype == dtype and np.isfinite(value) and np.isfinite(slope).all(), loss

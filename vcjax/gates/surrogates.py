@@ -10,8 +10,7 @@ here:
 σ is the logistic function and τ the temperature, in the unit of the margin. For τ → 0 soft becomes hard.
 Straight-through keeps the hard filter's numbers, verdicts and losses of them included, and says which way a threshold
 should go, but its derivative is that of no function, and what a gate passes no verdict on, as RE on what it leaves out,
-has none. Soft changes the numbers and
-has a true gradient, which finite differences confirm.
+has none. Soft changes the numbers and has a true gradient, which finite differences confirm.
 """
 
 from typing import Literal

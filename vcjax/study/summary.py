@@ -90,10 +90,10 @@ def per_run(runs: xr.Dataset) -> xr.Dataset:
     frames from first birth to first deletion.
 
     ANEES is the mean over frames of NEES / dof, 1 in expectation for a consistent filter; frames where it is not
-    defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `anees_map` is that of
-    the map in the last frame (see `metrics.map_nees`). `nis` is the mean squared
-    Mahalanobis distance of the accepted updates / 2, NaN where there was none; the gate cuts its tail off, so a
-    consistent filter has 1 − t·exp(−t) / (1 − exp(−t)) with t = Th₁ / 2, which is 0.95 for Th₁ = 9.
+    defined (see `metrics.trajectory_errors`) are left out, and NaN stands where it never is. `anees_map` is that of the
+    map in the last frame (see `metrics.map_nees`). `nis` is the mean squared Mahalanobis distance of the accepted
+    updates / 2, NaN where there was none; the gate cuts its tail off, so a consistent filter has 1 − t·exp(−t) / (1 −
+    exp(−t)) with t = Th₁ / 2, which is 0.95 for Th₁ = 9.
 
     Args:
         runs: one cell's runs with dimensions (..., seed, frame, feature).

@@ -9,7 +9,7 @@ straight-through run the losses of the tracks are those of the features deleted.
 
 A degree nearer than 1e-9 to 0 or 1 counts as that near where its logarithm is taken: there `cross_entropy` and
 `ranking_loss` do not change any more, and have no derivative. So they have none at all of a straight-through run, whose
-degrees are 0 and 1, and the worst mistakes of a soft one pull no more than those of about 20 τ.
+degrees are 0 and 1 (F1 has one), and of a soft one none by mistakes of more than about 20 τ.
 """
 
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from vcjax.fields import is_concrete, number, require
 from vcjax.filter.info import FrameInfo
+from vcjax.gates.surrogates import straight_through
 from vcjax.recording import Truth
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study.detection import happened, largest_by_feature
@@ -54,7 +55,9 @@ def tracks(info: FrameInfo, truth: Truth) -> Labelled:
     is_deleted = happened(info.inconsistent_id, num_features)
     by_detector = jnp.nan_to_num(largest_by_feature(info.watched_id, info.p_detector, num_features))
     place = jnp.where(each.counts, info.candidate_id, num_features).ravel()
-    log_not = jnp.log(jnp.maximum(1.0 - each.p, _CLOSEST)).ravel()
+    p_not = 1.0 - each.p.ravel()
+    # The derivative of the product by a factor of zero is the product of the others: it has to pass the cut-off.
+    log_not = jnp.log(straight_through(jax.lax.stop_gradient(jnp.maximum(p_not, _CLOSEST)), p_not))
     total = jnp.zeros(num_features, log_not.dtype).at[place].add(log_not, mode="drop")
     counts = is_deleted | happened(jnp.where(each.counts, info.candidate_id, -1), num_features)
     p = jnp.where(counts, 1.0 - (1.0 - by_detector) * jnp.exp(total), 0.0)
