@@ -49,10 +49,9 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     # What is of other settings is refused before any work, as far as that can be known then.
     for changed, *words in (
         (["--learning-rate", "0.1"], "start_0.json", "other settings (schedule.", "give another directory"),
-        (["--choosing-seeds", "3"], "candidates", "other settings (num_seeds: 2, now 3)"),
-        (["--held-out-seeds", "4"], "held_out", "other settings (num_seeds: 3, now 4)"),
+        (["--choosing-seeds", "3"], "choice_of_3/candidates", "other settings (num_seeds: 2, now 3)"),
+        (["--held-out-seeds", "4"], "choice_of_3/held_out", "other settings (num_seeds: 3, now 4)"),
         (["--landscape-points", "4"], "landscape_thresholds", "another number of settings than"),
-        (["--starts", "3"], "candidates", "another number of settings than"),
     ):
         assert main([*arguments, *changed]) == 1
         assert_one_line(said(capsys)[1], *words)
@@ -105,6 +104,8 @@ def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
         (["tune", "thresholds", "--th1", "-3"], ["th1=-3"]),
         (["tune", "thresholds", "--track-f1", "-1"], ["track_f1=-1"]),
         (["tune", "thresholds", "--landscape-points", "1"], ["--landscape-points 1", "at least 3"]),
+        (["tune", "thresholds", "--max-amplitude-m", "0.1"], ["--max-amplitude-m", "these stay", "`joint`"]),
+        (["tune", "thresholds", "--frequency-band-hz", "1", "4"], ["--frequency-band-hz", "these stay"]),
         (["tune", "thresholds", "--frequency-hz", "6"], ["not below half the frame rate"]),
         (["sweep", "--x", "config.gate.th3"], ["no numeric leaf 'config.gate.th3'"]),
         (["sweep", "--x", "config.gate.th2"], ["two numbers", "config.gate.th2"]),
@@ -134,7 +135,8 @@ def test_a_place_that_cannot_be_written_to_is_refused_before_any_work(command, p
     monkeypatch.setattr(evaluate, "run_lanes", lambda *_: pytest.fail("worked"))
     arguments = ["tune", "thresholds", *TUNE] if command == "tune" else ["sweep", *SWEEP]
     folder = tmp_path / "out" / "thresholds" if command == "tune" else tmp_path / "out"
-    bad = folder / place.format(command)
+    in_choice = command == "tune" and place in ("candidates", "held_out")
+    bad = folder / ("choice_of_4" if in_choice else "") / place.format(command)
     bad.parent.mkdir(parents=True, exist_ok=True)
     bad.write_text("mine")
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 1

@@ -223,7 +223,8 @@ def test_real_car(tmp_path):
     """Its velocities, integrated, end some 50 m from the truth after 695 m; its tracks make a recording."""
     data = np.load(Path(os.environ["VCJAX_DATA"]) / "kitti07_tracks" / "tracks.npz")
     odometry = from_velocities(data["time"], data["v_imu"], data["w_imu"], 0.5, 0.05)
-    T_b_c = np.linalg.inv(data["cam_T_imu"])
+    T_b_c = np.eye(4)  # the last column is the camera's place on the body, as in scripts/street_recording.py
+    T_b_c[:3, :3], T_b_c[:3, 3] = data["cam_T_imu"][:3, :3].T, data["cam_T_imu"][:3, 3]
     turn = Rotation.from_matrix(T_b_c[:3, :3]).as_quat(scalar_first=True)
     K = data["K"]
     calibration = Calibration(1226, 370, K[0, 0], K[1, 1], K[0, 2], K[1, 2], T_r_s=(*T_b_c[:3, 3], *turn))
@@ -235,7 +236,7 @@ def test_real_car(tmp_path):
     place, rotation = np.zeros(3), Rotation.identity()
     for increment in recording.odometry[:1101]:
         place, rotation = place + rotation.apply(increment[:3]), rotation * Rotation.from_rotvec(increment[3:])
-    T_w_b = [np.vstack([T, [0, 0, 0, 1]]) @ data["cam_T_imu"] for T in data["T_w_cam0"]]
+    T_w_b = [np.vstack([T, [0, 0, 0, 1]]) @ np.linalg.inv(T_b_c) for T in data["T_w_cam0"]]
     true = (np.linalg.inv(T_w_b[0]) @ T_w_b[-1])[:3, 3]
     assert 40 < np.linalg.norm(place - true) < 60
     assert json.loads((tmp_path / "c.json").read_text())["width"] == 1226

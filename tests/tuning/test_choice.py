@@ -186,6 +186,11 @@ def test_tuning_descends_from_each_start_chooses_and_goes_on_where_it_stopped(tm
     assert len(steps) == 1 and again.descents == whole.descents and again.choice.after == whole.choice.after
     xr.testing.assert_identical(again.choice.held_out, whole.choice.held_out)
     assert tuned(tmp_path).descents == whole.descents and len(steps) == 1
+    # Another start is one more descent: those that there are stay, and are among the candidates again.
+    more = tuned(tmp_path, num_starts=3)
+    assert len(steps) == 1 + 2 and more.descents[:2] == whole.descents
+    assert more.choice.candidates.sizes["setting"] == 4
+    assert tuned(tmp_path).choice.after == whole.choice.after and len(steps) == 3
 
     with pytest.raises(ValueError, match=r"start_0\.json has other settings \(schedule\..*; give another directory"):
         tuned(tmp_path, schedule=Schedule(num_steps=3, pairs_per_step=1))

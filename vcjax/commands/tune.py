@@ -70,6 +70,8 @@ class Tune:
         """Tune, draw, report."""
         if self.landscape_points in (1, 2) or self.landscape_points < 0:
             raise ValueError(f"--landscape-points {self.landscape_points}: give at least 3, or 0 for no landscape.")
+        if self.what == "thresholds":
+            self._refuse_what_has_no_effect()
         scenarios, directory, key = self.scenes.make(), self.out / self.what, numbered_key(self.key)
         config = FilterConfig(gate=VirtualCorrection(th1=self.th1, th2=self.th2), smoothing=self.smoothing)
         pairs = {"thresholds": self._thresholds, "oscillation": self._oscillation}
@@ -114,6 +116,17 @@ class Tune:
         print((directory / "tune.md").read_text())
         for path in paths:
             say(console, f"wrote {path}")
+
+    def _refuse_what_has_no_effect(self) -> None:
+        """Where A and f stay as they are, bounds of theirs were meant for something else.
+
+        Raises:
+            ValueError: naming the option.
+        """
+        for field in dataclasses.fields(self):
+            if field.name in ("max_amplitude_m", "frequency_band_hz") and getattr(self, field.name) != field.default:
+                option = f"--{field.name.replace('_', '-')}"
+                raise ValueError(f"{option}: of A and f; with `thresholds` these stay. Leave it out, or tune `joint`.")
 
     def _thresholds(self) -> dict[str, Interval]:
         """Where the thresholds may go.

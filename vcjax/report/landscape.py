@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import matplotlib
+import matplotlib.patheffects as patheffects
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -56,18 +57,19 @@ def landscape_figure(
         axes.set_xlabel(LABELS.get(x, x))
         axes.set_ylabel(LABELS.get(y, y))
         _scale(axes, grid[x].values, grid[y].values)
-        for path in paths:
+        for number, path in enumerate(paths):
             way = [p[x] for p in path], [p[y] for p in path]
-            axes.plot(*way, color="black", linewidth=2.4)  # an outline, for bright ground
-            axes.plot(*way, color="white", linewidth=1.2, marker=".", markersize=3)
+            outline = [patheffects.Stroke(linewidth=2.4, foreground="black"), patheffects.Normal()]  # for bright ground
+            label = None if number else "a descent"
+            axes.plot(*way, color="white", linewidth=1.2, marker=".", markersize=3, path_effects=outline, label=label)
         # One setting may be another: then the mark of the first is seen around that of the second.
         for (mark, setting), symbol, size in zip((marks or {}).items(), "os^D", (12, 8, 8, 8), strict=False):
             style = {"color": "#d55e00", "markeredgecolor": "white", "markersize": size, "label": mark}
             axes.plot(setting[x], setting[y], symbol, **style)
         axes.label_outer()
-    if marks:
-        handles, labels = panels[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(marks))
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
     figure.suptitle(title, fontsize=10)
     return figure
 
@@ -80,13 +82,18 @@ def _is_log(values: np.ndarray) -> bool:
 
 
 def _edges(values: np.ndarray) -> np.ndarray:
-    """Ends of the cells around values, half-way between them on the axis that they are drawn on."""
+    """Ends of the cells around values, half-way between them on the axis that they are drawn on.
+
+    The first does not reach below 0 where the values do not: no such number would make sense.
+    """
     if len(values) < 2:
         return values[0] + np.array([-0.5, 0.5])
     is_log = _is_log(values)
     places = np.log(values) if is_log else values
     middle = (places[1:] + places[:-1]) / 2
     edges = np.concatenate([[2 * places[0] - middle[0]], middle, [2 * places[-1] - middle[-1]]])
+    if not is_log and values[0] >= 0:
+        edges[0] = max(edges[0], 0.0)
     return np.exp(edges) if is_log else edges
 
 

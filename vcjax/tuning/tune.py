@@ -109,10 +109,10 @@ def tune(
     descent_key, choice_key = jax.random.split(key)
     kept = [_KeptSteps(directory, number, origin, start) for number, start in enumerate(starts)]
     before = [each.read() for each in kept]
+    num_candidates = 1 + sum(history is not None for history in before)
+    given = {"objective": problem.objective, "seeds": seeds, "key": choice_key}
     if directory is not None:
-        num_candidates = 1 + sum(history is not None for history in before)
-        given = {"objective": problem.objective, "seeds": seeds, "key": choice_key}
-        check_directory(directory, scenarios, config, num_candidates, **given)
+        check_directory(_choice_of(directory, num_candidates), scenarios, config, num_candidates, **given)
     descents, left_out = [], []
     for number, (start, history) in enumerate(zip(starts, before, strict=True)):
 
@@ -133,18 +133,16 @@ def tune(
                     raise
             kept[number].write(None)
         left_out.append(start)
-    choice = choose(
-        scenarios,
-        config,
-        [starts[0], *(end_of(problem, steps) for steps in descents)],
-        objective=problem.objective,
-        seeds=seeds,
-        key=choice_key,
-        directory=directory,
-        progress=progress,
-    )
+    candidates = [starts[0], *(end_of(problem, steps) for steps in descents)]
+    place = None if directory is None else _choice_of(directory, len(candidates))
+    choice = choose(scenarios, config, candidates, directory=place, progress=progress, **given)
     runs_per_step = 2 * schedule.pairs_per_step * len(scenarios)
     return Tuned(descents, choice, runs_per_step * (sum(map(len, descents)) + len(left_out)), left_out)
+
+
+def _choice_of(directory: Path, num_candidates: int) -> Path:
+    """Where a choice is kept: another for more starts, so that these go on from the descents that there are."""
+    return directory / f"choice_of_{num_candidates}"
 
 
 def _starts(problem: Problem, before: dict[str, float], num: int) -> list[dict[str, float]]:
