@@ -20,6 +20,7 @@ from vcjax.filter.submap import gather, scatter
 from vcjax.gates.gate import AbstractGate, Prior, Verdict
 from vcjax.gates.one_point_ransac import OnePointRansac
 from vcjax.gates.reprojection import ReprojectionError
+from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.models.camera import Camera
 
 # No gate and no conversion: what is left is the Kalman filter's algebra.
@@ -246,6 +247,28 @@ def test_an_unmeasured_candidate_changes_nothing_whatever_its_pixel(problem):
     assert_same(nobody, dense_normalise(state), tolerance=1e-15)
 
 
+@pytest.mark.parametrize("gate", [ReprojectionError(9.0), VirtualCorrection(), OnePointRansac()])
+@pytest.mark.parametrize(
+    "choice", [{}, {"update": "stacked"}, {"smoothing": "soft"}, {"smoothing": "straight_through"}]
+)
+def test_a_suspect_has_an_innovation_and_changes_nothing(problem, gate, choice):
+    """The state is that of a frame in which suspects were not found; of theirs nothing is decided."""
+    (state, slot, uv_px), is_measured = problem, np.ones(K, bool)
+    uv_px = uv_px + 40.0 * (np.arange(K) % 4 == 1)[:, None]  # some are left out, suspect or not
+    is_suspect = np.isin(np.arange(K), [0, 1, 2])
+    config = FilterConfig(**CHOICES | {"gate": gate} | choice)
+    _, without = submap_and_outcome(config, state, slot, uv_px, is_measured & ~is_suspect, np.zeros(K, bool))
+    submap, outcome = submap_and_outcome(config, state, slot, uv_px, is_measured, is_suspect)
+    other, _ = submap_and_outcome(config, state, slot, uv_px, is_measured & ~is_suspect, np.zeros(K, bool))
+    jax.tree.map(np.testing.assert_array_equal, submap, other)
+    for name in ("is_accepted", "is_recovered", "is_dynamic", "weight", "p_dynamic"):
+        found = getattr(outcome, name)
+        assert not found[is_suspect].any()
+        np.testing.assert_array_equal(found, getattr(without, name))
+    assert np.isfinite(outcome.innovation.z[is_suspect]).all() and (outcome.innovation.z[is_suspect] != 0).any()
+    assert np.isfinite(outcome.dynamic_margin[is_suspect]).all() and outcome.is_accepted.any()
+
+
 def supporters_of_the_best(state, slot, uv_px, is_measured, gate):
     """Each measured candidate corrects a copy of the whole state, means alone; whom it leaves within pixel noise."""
     best = np.zeros(K, bool), 0.0
@@ -302,6 +325,13 @@ def test_ransac_corrects_with_the_best_set_and_then_with_the_rescued(problem, up
     assert not outcome.is_dynamic.any() and (outcome.dynamic_margin[5] > 0) and outcome.weight[5] == 0
     assert accepted.sum() > 2 and rescued.any() and not (accepted | rescued)[[3, 5]].any()
     assert_same(correct(config, state, slot, hidden, is_measured), dense_normalise(expected))
+
+
+@quick_jit
+def submap_and_outcome(config, state, slot, uv_px, is_measured, is_suspect):
+    """The corrected submap, and what becomes of the candidates, some of them suspect."""
+    _, submap, _ = gather(config, state, slot)
+    return correct_frame(config, Camera(), submap, uv_px, is_measured, is_suspect)
 
 
 @quick_jit

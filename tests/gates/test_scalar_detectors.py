@@ -11,6 +11,7 @@ from vcjax.gates.cusum import Cusum
 from vcjax.gates.either import Either
 from vcjax.gates.immediate import Immediate
 from vcjax.gates.inlier_ratio import InlierRatio
+from vcjax.gates.velocity_glr import VelocityGLR
 from vcjax.gates.velocity_likelihood_ratio import VelocityLikelihoodRatio
 from vcjax.gates.windowed_nis import WindowedNIS
 
@@ -161,6 +162,15 @@ def test_either_flags_what_one_of_them_flags():
     flags = np.stack([np.asarray(margin) > 0 for _, margin in alone])
     np.testing.assert_array_equal(np.asarray(margins) > 0, flags.any(axis=0))
     assert all((alone != flags.any(axis=0)).any() for alone in flags)
+
+
+def test_either_suspects_whom_one_of_them_suspects():
+    low, high, nobody = VelocityGLR(suspect=2.0), VelocityGLR(suspect=5.0), InlierRatio()
+    state = low.born()
+    assert Either(nobody, Cusum()).suspicion((nobody.born(), Cusum().born())) is None
+    for first, second in ((low, nobody), (nobody, low), (high, low), (low, high)):
+        states = tuple(state if isinstance(each, VelocityGLR) else each.born() for each in (first, second))
+        assert Either(first, second).suspicion(states) == -2.0
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -233,6 +233,8 @@ def test_derivatives_are_finite_differences():
         (dict(false_alarm_rate=1.5), r"VelocityGLR\(false_alarm_rate=1.5\)"),
         (dict(threshold=-1), r"VelocityGLR\(threshold=-1.0\): .*positive χ²"),
         (dict(false_alarm_rate=0.01, threshold=17), r"\(false_alarm_rate=0.01, threshold=17.0\): .*one of them"),
+        (dict(suspect=0.0), r"VelocityGLR\(suspect=0.0\): .*positive χ²"),
+        (dict(suspect=17, threshold=17), r"VelocityGLR\(suspect=17.0, threshold=17.0\): .*a smaller value for suspect"),
         (dict(velocity_std_m_s=0), r"VelocityGLR\(velocity_std_m_s=0.0\)"),
         (dict(threshold=20, forgetting=1.1), r"VelocityGLR\(forgetting=1.1\): .*\(0, 1\]"),
         (dict(forgetting=0.9), r"VelocityGLR\(forgetting=0.9\).*give a threshold, or forgetting=1"),
@@ -241,6 +243,18 @@ def test_derivatives_are_finite_differences():
 def test_bad_input_is_refused_by_name_and_value(fields, message):
     with pytest.raises(ValueError, match=message):
         VelocityGLR(**fields)
+
+
+@pytest.mark.parametrize("other", [dict(threshold=17.0), dict(false_alarm_rate=0.9)])
+def test_suspect_is_who_passes_a_smaller_value(other):
+    detector, record = VelocityGLR(suspect=4.0, velocity_std_m_s=0.1, **other), random_record(0)
+    states, _ = observe_all(detector, born(detector, NUM_SLOTS), record)
+    suspicion = jax.vmap(detector.suspicion)(states)
+    D, d = np.asarray(states.D) + np.eye(3) / 0.1**2, np.asarray(states.d)
+    statistic = np.sum(d * np.linalg.solve(D, d[..., None])[..., 0], axis=-1)
+    np.testing.assert_allclose(suspicion, statistic - 4.0, rtol=1e-8, atol=1e-10)
+    assert (suspicion > 0).any() and (suspicion < 0).any()
+    assert VelocityGLR(**other).suspicion(states) is None and detector.suspicion(detector.born()) == -4.0
 
 
 def test_the_rate_is_one_percent_unless_another_or_a_threshold_is_given():

@@ -43,7 +43,12 @@ class Outcome(NamedTuple):
 
 
 def correct_frame(
-    config: FilterConfig, camera: Camera, submap: Submap, uv_px: Float[Array, "K 2"], is_measured: Bool[Array, " K"]
+    config: FilterConfig,
+    camera: Camera,
+    submap: Submap,
+    uv_px: Float[Array, "K 2"],
+    is_measured: Bool[Array, " K"],
+    is_suspect: Bool[Array, " K"] | None = None,
 ) -> tuple[Submap, Outcome]:
     """Correct with the accepted candidates, judge the isolated ones, correct with the recovered. Paper section 3.
 
@@ -53,30 +58,33 @@ def correct_frame(
         submap: vehicle and candidates after prediction.
         uv_px: measured pixels, anything where not measured.
         is_measured: which candidates have a measurement; the others change nothing.
+        is_suspect: which have an innovation, but are neither corrected with nor judged (see
+            `AbstractDetector.suspicion`); None: nobody.
 
     Returns: the corrected submap, and the candidates' innovations and verdicts.
     """
     predicted, gate = submap, config.gate
     # An unmeasured candidate's pixel may be anything, NaN included; zero keeps derivatives finite.
     uv_px = jnp.where(is_measured[:, None], uv_px, 0.0)
+    is_usable = is_measured if is_suspect is None else is_measured & ~is_suspect
     everyone = jnp.arange(is_measured.shape[0])
     innovation = margin = None
     if isinstance(gate, AbstractJointGate):
-        innovation, joint = innovate_jointly(config, camera, predicted, uv_px, is_measured)
+        innovation, joint = innovate_jointly(config, camera, predicted, uv_px, is_usable)
         margin = gate.margins(joint)
     elif gate.prior == "predicted" or config.update == "stacked":
         at_prediction = jax.vmap(lambda j, y: innovate(config, camera, predicted, j, y)[0])
         innovation = at_prediction(everyone, uv_px)
         margin = gate.margin(innovation.re1)
     if innovation is None or margin is None:
-        submap, innovation, margin = _correct_accepted(config, camera, submap, uv_px, is_measured)
+        submap, innovation, margin = _correct_accepted(config, camera, submap, uv_px, is_usable)
     elif config.update == "stacked":
-        submap = correct_stacked(config, camera, submap, uv_px, is_measured & (margin > 0))
+        submap = correct_stacked(config, camera, submap, uv_px, is_usable & (margin > 0))
     else:
-        submap, _, _ = _correct_accepted(config, camera, submap, uv_px, is_measured, margin)
-    is_accepted = is_measured & (margin > 0)
-    is_isolated = is_measured & ~is_accepted
-    is_judged = is_isolated if config.smoothing == "hard" else is_measured
+        submap, _, _ = _correct_accepted(config, camera, submap, uv_px, is_usable, margin)
+    is_accepted = is_usable & (margin > 0)
+    is_isolated = is_usable & ~is_accepted
+    is_judged = is_isolated if config.smoothing == "hard" else is_usable
 
     def judge(submap: Submap) -> tuple[Submap, Verdict]:
         prior = predicted if gate.prior == "predicted" else submap
@@ -91,7 +99,7 @@ def correct_frame(
         return _correct_recovered(config, camera, submap, uv_px, is_isolated, margin, verdict), verdict
 
     def judge_nobody(submap: Submap) -> tuple[Submap, Verdict]:
-        nothing = jnp.full(is_measured.shape, jnp.nan, uv_px.dtype)
+        nothing = jnp.full(is_usable.shape, jnp.nan, uv_px.dtype)
         return submap, Verdict(nothing, nothing, nothing)
 
     # In most frames nobody is isolated.
@@ -105,9 +113,9 @@ def correct_frame(
     weight = (is_accepted | is_recovered).astype(uv_px.dtype)
     p_dynamic = is_dynamic.astype(uv_px.dtype)
     if config.smoothing != "hard":
-        soft_weight = jnp.where(is_measured, _soft_weight(config, margin, verdict), 0.0)
+        soft_weight = jnp.where(is_usable, _soft_weight(config, margin, verdict), 0.0)
         # What a gate leaves out without a verdict, it does not call dynamic.
-        may_be_dynamic = is_measured & ~jnp.isnan(verdict.margin) & gate.condemns
+        may_be_dynamic = is_usable & ~jnp.isnan(verdict.margin) & gate.condemns
         soft_p = jnp.where(may_be_dynamic, 1.0 - soft_weight, 0.0)
         is_soft = config.smoothing == "soft"
         weight = soft_weight if is_soft else straight_through(weight, soft_weight)

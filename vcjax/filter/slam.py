@@ -1,8 +1,9 @@
 """EKF-SLAM: `start` for the first frame, `step` for every other (`run` takes a whole recording).
 
 One frame, in order: prediction (6) (7); every landmark's pixel predicted; the K most uncertain visible ones chosen;
-formal corrections (8)–(12), the gate's verdict (13) (14), corrections with the recovered; deletion of what gate or
-detector flagged, which is then followed outside the map if wanted; retirement of what cannot matter any more; births.
+formal corrections (8)–(12) with those that the detector does not suspect, the gate's verdict on the others (13) (14),
+corrections with the recovered; deletion of what gate or detector flagged, which is then followed outside the map if
+wanted; retirement of what cannot matter any more; births.
 """
 
 from typing import Any
@@ -90,8 +91,11 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     is_measured = is_searched & (column[slot] >= 0)
     uv_px = frame.uv_px[column[slot]]
 
+    detector = _of_mapped(config, state)
+    suspicion = config.detector.suspicion(detector)
     state, submap, rows = gather(config, state, slot)
-    submap, outcome = correct_frame(config, frame.camera, submap, uv_px, is_measured)
+    is_suspect = None if suspicion is None else suspicion[slot] > 0
+    submap, outcome = correct_frame(config, frame.camera, submap, uv_px, is_measured, is_suspect)
     state = scatter(config, state, submap, slot, rows)
     innovation, verdict = outcome.innovation, outcome.verdict
 
@@ -102,7 +106,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     is_watched = state.is_mapped & ~is_dynamic
     R = pixel_cov(config, innovation.S.dtype)
     evidence = evidence_of(outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, R, frame.time_step_s)
-    detector, margin = config.detector.observe(_of_mapped(config, state), evidence)
+    detector, margin = config.detector.observe(detector, evidence)
     margin = jnp.where(is_watched, margin, jnp.nan).astype(state.P_vv.dtype)
     is_flagged = margin > 0
     state = eqx.tree_at(lambda s: s.detector, state, detector)

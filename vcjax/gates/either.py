@@ -33,6 +33,12 @@ class Either(AbstractDetector):
         second, second_margin = self.second.observe(state[1], evidence)
         return (first, second), jnp.fmax(first_margin, second_margin)
 
+    def suspicion(self, state: PyTree) -> Float[Array, "*L"] | None:
+        """The larger, of those that suspect anybody."""
+        found = self.first.suspicion(state[0]), self.second.suspicion(state[1])
+        first, *others = [each for each in found if each is not None] or [None]
+        return jnp.fmax(first, others[0]) if others else first
+
     def velocity(self, state: PyTree) -> tuple[Float[Array, "*L 3"], Float[Array, "*L 3 3"]] | None:
         """That of the first that estimates one."""
         first = self.first.velocity(state[0])

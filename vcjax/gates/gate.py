@@ -228,6 +228,14 @@ class AbstractDetector(eqx.Module):
         can be said. What it decides is smoothed, or not, by `surrogates`.
         """
 
+    def suspicion(self, state: PyTree) -> Float[Array, "*L"] | None:
+        """By how much each slot's landmark is suspect, χ² units; None: nobody ever is.
+
+        Where above 0 it is measured and watched, and corrects nothing, until it is flagged or found harmless: a hard
+        decision in all filters, soft ones too.
+        """
+        return None
+
     def velocity(self, state: PyTree) -> tuple[Float[Array, "*L 3"], Float[Array, "*L 3 3"]] | None:
         """Estimated velocity of each slot's landmark, m/s, and its covariance, m²/s²; None: it estimates none."""
         return None
