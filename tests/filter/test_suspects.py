@@ -1,5 +1,7 @@
 """Landmarks that the detector suspects, in whole runs: measured, tested, and left out until they are harmless."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +37,7 @@ def test_who_is_suspect_is_left_out_until_it_calms_down():
     num_left_out = num_back = 0
     suspects_before: set[int] = set()
     ever: set[int] = set()
-    for (before, _), (_, info) in zip(run[:-1], run[1:], strict=True):
+    for (before, _), (_, info) in itertools.pairwise(run):
         suspicion = np.asarray(detector.suspicion(before.detector))
         suspects = set(np.asarray(before.track_id)[(suspicion > 0) & np.asarray(before.is_mapped)].tolist())
         is_suspect = np.isin(info.candidate_id, list(suspects)) & info.is_measured
