@@ -4,6 +4,7 @@ import importlib.util
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fake_runs import fake_runs, with_failed_seed
 from scipy import stats
@@ -100,3 +101,33 @@ def test_damage_refuses_what_holds_no_runs_in_one_line(tmp_path, damage):
         with pytest.raises(SystemExit, match=words) as refused:
             damage.main(damage.Study(directory, (method,)))
         assert len(str(refused.value).splitlines()) == 1
+
+
+def followed_run(num_frames=30):
+    """Mover 3 stands from frame 10 to 19, and 4 is never followed; 7 stands always."""
+    moves = np.zeros((num_frames, 8), bool)
+    moves[:10, 3:5] = moves[20:, 3:5] = True
+    nobody = np.full((num_frames, 2), -1)
+    run = {"moves": moves, "deleted": nobody.copy(), "handed_back": nobody.copy(), "followed": nobody.copy()}
+    run |= {"velocity_m_s": np.zeros((num_frames, 2, 3)), "error_m": np.full((num_frames, 3), 0.03)}
+    run["deleted"][[2, 23], 0] = 3
+    run["deleted"][5, 1] = 7
+    run["followed"][2:14, 1] = 3
+    run["velocity_m_s"][:, 1] = (0.3, 0.4, 0.0)
+    run["handed_back"][14, 1] = 3
+    return run
+
+
+def test_followed_movers_are_counted_when_they_stop_stand_and_start_again():
+    study, run = script("follow_movers"), followed_run()
+    told = study.stops([run, run])
+    assert "2 followed when they stop, their velocity off by 0.30, 0.10, 0.00 m/s" in told
+    assert "2 handed back while they stand, within 4 frames (median)" in told
+    assert "2 of these flagged again, within 3 frames (median) of their start; 0 handed back while they move" in told
+    assert study.never_stop([run]) == "1 of 2 movers flagged and 0 of 1 others handed back"
+    early = followed_run()
+    early["handed_back"][[4, 14], 1] = 3, -1
+    assert (
+        "0 handed back while they stand" in (told := study.stops([early])) and "1 handed back while they move" in told
+    )
+    np.testing.assert_allclose(study.position_cm([run]), 100 * 0.03 * np.sqrt(3))
