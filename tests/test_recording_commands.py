@@ -15,6 +15,7 @@ from told import assert_one_line, said
 
 import vcjax as vc
 from vcjax.cli import main
+from vcjax.recording import last_sightings
 from vcjax.sources.map_file import read_map
 from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import load_recording, save_recording
@@ -231,6 +232,33 @@ def test_scale_by_a_distance_by_points_or_free(bare, tmp_path, capsys):
     assert main([*command, "--known-distance", "0", "99999", "1"]) == 1
     assert_one_line(said(capsys)[1], "known distance from track 99999: the recording has no such track")
     assert contents(out) == before
+
+
+def test_known_points_keep_their_tracks_where_tracks_are_cut(tmp_path, capsys):
+    """Ids that are nothing like the numbers of pieces, and tracks that are cut all around the known one."""
+    content, found = recorded.content(), recorded.run().landmarks
+    recording, uv_px = content.recording, np.array(content.recording.uv_px)
+    is_valid, ids = np.asarray(recording.is_valid), np.asarray(recording.track_id)
+    for column in np.flatnonzero(is_valid[20]):
+        if len(before := np.flatnonzero(is_valid[19] & (ids[19] == ids[20, column]))):
+            uv_px[20, column] = uv_px[19, before[0]]
+    ends = {int(track): np.flatnonzero((is_valid & (ids == track)).any(axis=1)) for track in found.track_id}
+    is_whole = [ends[int(track)][0] == 0 and ends[int(track)][-1] < 19 for track in found.track_id]
+    best = np.argmin(np.where(is_whole, np.trace(found.cov, axis1=1, axis2=2), np.inf))
+    ids = np.where(is_valid, 1000 - ids, 0)
+    changed = {"track_id": ids, "uv_px": uv_px, "is_last": last_sightings(ids, is_valid)}
+    recording = dataclasses.replace(recording, **changed)
+    path = save_recording(tmp_path / "a.npz", content._replace(recording=recording, labels=None, image_paths=None))
+    points, known, (x, y, z) = tmp_path / "points.csv", 1000 - int(found.track_id[best]), found.place_m[best]
+    points.write_text(f"track_id,x,y,z\n{known},{x},{y},{z}\n")
+    command = ["run", str(path), *recorded.OPTIONS, "--cut-repeats", "--known", str(points), "--pictures", "0"]
+    assert main([*command, "--animation", "none", "--out", str(tmp_path / "run")]) == 0
+    mapped = read_map(tmp_path / "run" / "landmarks.csv")
+    distance = np.linalg.norm(mapped.place_m - [x, y, z], axis=1)
+    assert int(mapped.track_id[np.argmin(distance)]) == known and distance.min() < 0.02
+    assert mapped.kind[np.argmin(distance)] == "accepted"
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["scale"] == "known from odometry" and summary["tracks_cut"] > 20
 
 
 def test_missing_images_are_told_and_drawn_without(tmp_path, capsys):

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import recorded
 
 from vcjax.recording import validate
@@ -67,3 +68,21 @@ def test_a_recording_is_cut_in_place():
     assert same.num_cuts == 0
     np.testing.assert_array_equal(same.track_of(same.recording.track_id)[frame, column], ids[frame, column])
     np.testing.assert_array_equal(same.recording.is_last, recording.is_last)
+
+
+def test_pieces_and_tracks_are_told_apart_by_number():
+    """Tracks 900 and 5, the first cut in frame 1: no number of a piece is that of its track."""
+    recording = recorded.content().recording
+    ids, uv_px = np.zeros((30, 2), np.int64), np.zeros((30, 2, 2))
+    ids[:] = 900, 5
+    uv_px[:, 0], uv_px[:, 1] = 50.0 + np.arange(30)[:, None], 90.0 - np.arange(30)[:, None]
+    uv_px[1, 0] = uv_px[0, 0]
+    seen = np.ones((30, 2), bool)
+    parts = {"track_id": ids, "uv_px": uv_px, "is_valid": seen, "is_last": np.zeros_like(seen)}
+    cut = cut_recording(dataclasses.replace(recording, **parts))
+    assert cut.origin.tolist() == [5, 900, 900] and cut.recording.track_id[:2].tolist() == [[1, 0], [2, 0]]
+    assert cut.first_piece_of(np.array([900, 5])).tolist() == [1, 0]
+    with pytest.raises(ValueError, match=r"first_piece_of\(track_id=7\): the recording has no such track"):
+        cut.first_piece_of(np.array([900, 7]))
+    with pytest.raises(ValueError, match=r"track_of\(piece=5\): there are 3 pieces"):
+        cut.track_of(np.array([0, -1, 5]))

@@ -93,13 +93,13 @@ class Run:
         out = self.out or Path("results") / f"{self.recording.stem}_{self.gate}"
         check_writable(out / "summary.json")
         content = load_recording(self.recording)
-        known, distance = self._known(content)
+        cut = cut_recording(content.recording) if self.cut_repeats else None
+        known, distance = self._known(content, cut)
         source = scale_source(self.config.motion, content.recording, known)
         if distance is not None:
             check_known_distance(distance, content.recording, source)
         if self.config.motion.gives_scale and not np.any(np.asarray(content.recording.odometry)):
             say(console, NO_ODOMETRY)
-        cut = cut_recording(content.recording) if self.cut_repeats else None
         recording = content.recording if cut is None else cut.recording
         unfinished = Unfinished(out / "unfinished", self.config, recording, known)
         with progress_bar(console, "compiling, filtering") as show:
@@ -133,13 +133,17 @@ class Run:
         unfinished.remove()
         say(console, f"wrote {out}")
 
-    def _known(self, content: RecordingFile) -> tuple[KnownLandmarks | None, KnownDistance | None]:
-        """What is known of lengths, in the filter's terms."""
+    def _known(
+        self, content: RecordingFile, cut: CutRecording | None
+    ) -> tuple[KnownLandmarks | None, KnownDistance | None]:
+        """What is known of lengths, in the filter's terms: known points are what their tracks followed at first."""
         known = distance = None
         if not 0 < self.lengths.known_std_m < np.inf:
             raise ValueError(f"--known-std-m {self.lengths.known_std_m}: give a positive number of metres.")
         if self.lengths.known is not None:
-            known = KnownLandmarks(*read_known_points(self.lengths.known, content), self.lengths.known_std_m)
+            track_id, place_m = read_known_points(self.lengths.known, content)
+            track_id = track_id if cut is None else cut.first_piece_of(track_id)
+            known = KnownLandmarks(track_id, place_m, self.lengths.known_std_m)
         if self.lengths.known_distance is not None:
             first, second, distance_m = self.lengths.known_distance
             distance = KnownDistance((first, second), distance_m)

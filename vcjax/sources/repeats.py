@@ -31,11 +31,29 @@ class CutRecording(NamedTuple):
     num_cuts: int
 
     def track_of(self, piece: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
-        """Which track each piece belongs to; -1, nobody, stays."""
+        """Which track each piece belongs to; -1, nobody, stays.
+
+        Raises:
+            ValueError: for a piece that there is not.
+        """
         piece = np.asarray(piece)
         if not len(self.origin):
             return piece
-        return np.where(piece >= 0, self.origin[piece.clip(0, len(self.origin) - 1)], -1).astype(piece.dtype)
+        if np.any(is_none := piece >= len(self.origin)):
+            raise ValueError(f"track_of(piece={piece[is_none].flat[0]}): there are {len(self.origin)} pieces, from 0.")
+        return np.where(piece >= 0, self.origin[piece], -1).astype(piece.dtype)
+
+    def first_piece_of(self, track_id: Int[np.ndarray, "*n"]) -> Int[np.ndarray, "*n"]:
+        """The piece of each track that begins first.
+
+        Raises:
+            ValueError: for a track that there is not.
+        """
+        track_id = np.asarray(track_id)
+        tracks, first = np.unique(self.origin, return_index=True)  # pieces are numbered in order of time
+        if np.any(is_none := ~np.isin(track_id, tracks)):
+            raise ValueError(f"first_piece_of(track_id={track_id[is_none].flat[0]}): the recording has no such track.")
+        return first[np.searchsorted(tracks, track_id)].astype(track_id.dtype)
 
 
 class _Sorted(NamedTuple):
