@@ -424,6 +424,40 @@ def test_what_is_refused_is_said_clearly(arguments, words, tmp_path, monkeypatch
     assert {path.name for path in tmp_path.iterdir()} == {"file", "folder"}
 
 
+def test_no_command_replaces_what_is_not_its_own(results, folder, tmp_path, capsys):
+    """Neither what it reads, nor, of a run, files of its names that no run has written."""
+    mine, sequence, run = tmp_path / "mine", tmp_path / "sequence", tmp_path / "run"
+    shutil.copytree(folder, sequence)
+    shutil.copytree(results, run)
+    (mine / "unfinished").mkdir(parents=True)
+    (mine / "unfinished" / "notes.txt").write_text("mine")
+    tracks = write_tracks(mine / "tracks.csv", tracked())
+    recording, calibration = mine / "a.npz", sequence / "calibration.json"
+    shutil.copy(recorded.recording_path(), recording)
+    before, is_read = contents(tmp_path), "is one of the files that are read"
+    commands = {
+        f"run {recording} --out {mine}": "tracks.csv is in the way of the run's",
+        f"run {recording} --known {run / 'landmarks.csv'} --out {run}": f"landmarks.csv {is_read}",
+        f"inspect {recording} --picture {recording}": f"a.npz {is_read}",
+        f"record {tracks} --calibration {calibration} --rate-hz 10 --out {tracks}": f"tracks.csv {is_read}",
+        f"record {tracks} --calibration {calibration} --rate-hz 10 --out {calibration}": f"calibration.json {is_read}",
+        f"track {sequence} --out {sequence / 'images' / '00003.png'}": f"00003.png {is_read}",
+        f"evaluate {run} --out {run / 'robot_tum.txt'}": f"robot_tum.txt {is_read}",
+        f"evaluate {run / 'robot_tum.txt'} --truth {recording} --out {recording}": f"a.npz {is_read}",
+    }
+    for command, words in commands.items():
+        assert main(command.split()) == 1, command
+        printed, told = said(capsys)
+        assert printed == ""
+        assert_one_line(told, words)
+        assert contents(tmp_path) == before, command
+    tracks.unlink()
+    options = ["--pictures", "0", "--animation", "none", "--out", str(mine)]
+    for _ in range(2):  # and again
+        assert main(["run", str(recording), *recorded.OPTIONS, *options]) == 0
+    assert (mine / "unfinished" / "notes.txt").read_text() == "mine" and (mine / "tracks.csv").exists()
+
+
 def test_evaluate_without_anything_to_compare_with(results, tmp_path, capsys):
     bare = save_recording(tmp_path / "bare.npz", recorded.content().recording)
     assert main(["evaluate", str(results), "--truth", str(bare)]) == 1

@@ -102,6 +102,17 @@ def test_writable_places_are_found_so_without_a_trace(tmp_path):
         check_writable(tmp_path)
 
 
+def test_what_is_read_is_not_written_to(tmp_path):
+    path = tmp_path / "a.csv"
+    check_writable(path, [path, None])  # it is not there
+    path.write_text("mine")
+    check_writable(tmp_path / "b.csv", [path, None, tmp_path / "c.csv"])
+    (tmp_path / "link.csv").symlink_to(path)
+    for place in (path, tmp_path / "link.csv"):
+        with pytest.raises(FileExistsError, match=r"csv is one of the files that are read; give another place"):
+            check_writable(place, [None, path])
+
+
 @pytest.mark.parametrize("refuse", [check_writable, lambda place: write_file(place, b"")])
 def test_refusal_of_the_system_names_the_place_that_was_asked_for(tmp_path, monkeypatch, refuse):
     def refuse_temporary(*_, **__):

@@ -8,7 +8,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -126,13 +126,19 @@ def with_nulls(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def check_writable(path: str | os.PathLike) -> None:
+def check_writable(path: str | os.PathLike, read: Iterable[str | os.PathLike | None] = ()) -> None:
     """Refuse a place that a file cannot be written to, before the work that it is to hold; nothing is left there.
+
+    Args:
+        path: the place.
+        read: files that the work is made of, which it must not replace; None stands for none.
 
     Raises:
         OSError: naming the place and what is wrong with it.
     """
     path = Path(path)
+    if path.exists() and any(s is not None and os.path.exists(s) and path.samefile(s) for s in read):
+        raise FileExistsError(f"{path} is one of the files that are read; give another place for the result.")
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a directory; give the name of a file.")
     folder = next(parent for parent in path.absolute().parents if parent.exists())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import recorded
 
-from vcjax.recorded.run_folder import camera_poses, new_run, read_run, robot_poses
+from vcjax.recorded.run_folder import camera_poses, check_place, new_run, read_run, robot_poses
 from vcjax.recorded.run_summary import run_summary
 from vcjax.recorded.verdicts import track_verdicts, verdicts
 from vcjax.sources.map_file import read_map
@@ -98,6 +98,33 @@ def test_files_of_an_earlier_run_give_way_and_others_stay(tmp_path):
     assert found["notes.txt"] == b"mine" and "features/000003.png" in found
     assert not {"features/000099.png", "features.gif", "tracks.csv", "verdicts.csv", "landmarks.csv"} & set(found)
     assert not [name for name in found if "tmp" in name]
+
+
+@pytest.mark.parametrize("name", ["tracks.csv", "tracks.parquet", "path.png", "features/000003.png", "summary.json"])
+def test_files_that_no_run_has_written_are_in_the_way(tmp_path, name):
+    """Until they are a run's: by its summary, or by what is left of one that was stopped."""
+    (tmp_path / "features").mkdir()
+    (tmp_path / "features" / "1_mine.png").write_bytes(b"mine")
+    check_place(tmp_path)
+    (tmp_path / name).write_text("{}")
+    with pytest.raises(FileExistsError, match=rf"{name} is in the way of the run's, and no run has written it"):
+        check_place(tmp_path)
+    (tmp_path / "unfinished").mkdir()
+    (tmp_path / "unfinished" / "state.npz").write_bytes(b"")
+    check_place(tmp_path)
+    (tmp_path / "unfinished" / "state.npz").unlink()
+    (tmp_path / ".filling.abc.tmp").mkdir()
+    check_place(tmp_path)
+    write(tmp_path)
+    check_place(tmp_path)
+    assert (tmp_path / "features" / "1_mine.png").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("name", ["features", "unfinished"])
+def test_a_file_in_place_of_a_folder_is_found_before_the_run(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(NotADirectoryError, match=f"{name} is a file"):
+        check_place(tmp_path)
 
 
 BAD = {

@@ -131,6 +131,7 @@ def test_killed_again_and_again_ends_the_same(tmp_path):
     assert command(alone).wait() == 0 and not (alone / "unfinished").exists()
     out.mkdir()
     (out / "robot_tum.txt").write_text("of an earlier run")
+    (out / "summary.json").write_text(json.dumps({"recording": "a.npz", "frames": 30, "first_failure": None}))
     rng, where = np.random.default_rng(0), []
     for _ in range(3):
         child, seen = command(out), len(list(out.glob("unfinished/frames_*")))

@@ -34,7 +34,7 @@ class Bench:
         """Measure, print, save, compare."""
         accepted = None if self.baseline is None else benchmark.read_ratios(self.baseline)
         if self.json is not None:
-            check_writable(self.json)
+            check_writable(self.json, [self.baseline])
         measured = benchmark.where()
         for part in self.only:
             with console.status(f"measuring: {part}"):

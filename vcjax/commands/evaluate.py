@@ -10,7 +10,7 @@ from jaxtyping import Float
 from rich.console import Console
 
 from vcjax.commands.console import say
-from vcjax.recorded.run_folder import RunFolder, read_run
+from vcjax.recorded.run_folder import RunFolder, read_run, run_files
 from vcjax.recorded.track_detection import labels_of, track_detection, track_detection_text
 from vcjax.recorded.trajectory_error import Trajectory, trajectory_error, trajectory_error_text
 from vcjax.recorded.unfinished import digest
@@ -38,10 +38,10 @@ class Evaluate:
 
     def __call__(self, console: Console) -> None:
         """Read, compare, print."""
-        if self.out is not None:
-            check_writable(self.out)
         run = read_run(self.estimate) if self.estimate.is_dir() else None
         path = self._truth_path(run)
+        if self.out is not None:
+            check_writable(self.out, (path, self.estimate, *run_files(self.estimate)))
         estimate = _trajectory(self.estimate if run is None else self.estimate / f"{self.truth_of}_tum.txt")
         content = load_recording(path) if path.suffix.lower() == ".npz" else None
         if run is not None and content is not None and self.truth is None:

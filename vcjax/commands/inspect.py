@@ -26,6 +26,6 @@ class Inspect:
         """Read, print, draw."""
         content = load_recording(self.recording)
         picture = self.picture or self.recording.with_name(f"{self.recording.stem}_overview.png")
-        check_writable(picture)
+        check_writable(picture, [self.recording])
         print(summary(content))
         say(console, f"wrote {write_picture(draw_overview(content), picture)}")

@@ -40,7 +40,8 @@ class Record:
 
     def __call__(self, console: Console) -> None:
         """Read, check, save, say what is in it."""
-        check_writable(self.out)
+        tables = self.tracks, self.calibration, self.odometry, self.times, self.truth, self.labels
+        check_writable(self.out, tables)
         if (self.times is None) == (self.rate_hz is None):
             raise ValueError("give --times or --rate-hz, one of the two.")
         content = record_tables(

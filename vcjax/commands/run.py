@@ -30,7 +30,6 @@ from vcjax.sources.odometry import dead_reckoning
 from vcjax.sources.recording_file import RecordingFile, load_recording
 from vcjax.sources.repeats import CutRecording, cut_recording
 from vcjax.sources.warnings import NO_ODOMETRY
-from vcjax.storage import check_writable
 from vcjax.study.results import describe
 
 MotionName = Literal["odometry", "biased_odometry", "constant_velocity"]
@@ -72,7 +71,8 @@ class Run:
     lengths: Lengths = dataclasses.field(default_factory=Lengths)
     """What is known of lengths."""
     out: Path | None = None
-    """Directory of the results; results/NAME_GATE if not given. Results of an earlier run give way when all is done."""
+    """Directory of the results; results/NAME_GATE if not given. Results of an earlier run give way when all is done;
+    where other files lie in their way nothing is run."""
     table: Literal["csv", "parquet"] = "csv"
     """Format of the tables."""
     pictures: int = 8
@@ -91,7 +91,7 @@ class Run:
         if self.animation_frames < 1:
             raise ValueError(f"--animation-frames {self.animation_frames}: give at least 1, or --animation none.")
         out = self.out or Path("results") / f"{self.recording.stem}_{self.gate}"
-        check_writable(out / "summary.json")
+        run_folder.check_place(out, [self.recording, self.lengths.known])
         content = load_recording(self.recording)
         cut = cut_recording(content.recording) if self.cut_repeats else None
         known, distance = self._known(content, cut)
@@ -101,7 +101,7 @@ class Run:
         if self.config.motion.gives_scale and not np.any(np.asarray(content.recording.odometry)):
             say(console, NO_ODOMETRY)
         recording = content.recording if cut is None else cut.recording
-        unfinished = Unfinished(out / "unfinished", self.config, recording, known)
+        unfinished = Unfinished(out / run_folder.UNFINISHED, self.config, recording, known)
         with progress_bar(console, "compiling, filtering") as show:
             filtered = filter_recording(self.config, recording, show, known, unfinished=unfinished)
         if cut is not None:

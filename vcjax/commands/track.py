@@ -59,7 +59,9 @@ class Track:
 
     def __call__(self, console: Console) -> None:
         """Read, follow, save, say what came out."""
-        check_writable(self.out)
+        # Whatever lies in the folder may be read, but for recordings, which people keep there.
+        lying = (path for path in self.folder.rglob("*") if path.suffix.lower() != ".npz")
+        check_writable(self.out, (self.calibration, *lying))
         for name, least in (("first", 0), ("step", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} {getattr(self, name)}: give a whole number of at least {least}.")

@@ -16,7 +16,7 @@ Tables are CSV or Parquet. In columns re1, re2 and of margins nan stands where t
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -32,7 +32,7 @@ from vcjax.sources.image_sequence import camera_of_robot
 from vcjax.sources.map_file import LandmarkMap, write_map
 from vcjax.sources.table_file import Kind, read_table, write_table
 from vcjax.sources.trajectory_file import read_tum, write_kitti, write_tum
-from vcjax.storage import filling, write_json
+from vcjax.storage import check_writable, filling, write_json
 
 TableFormat = Literal["csv", "parquet"]
 TABLES, ENDINGS = ("landmarks", "verdicts", "tracks", "followers"), ("csv", "parquet")
@@ -40,7 +40,11 @@ _MARGINS = ("margin", "detector_margin")
 _VELOCITY_COV = ("cov_vx_vx", "cov_vx_vy", "cov_vx_vz", "cov_vy_vy", "cov_vy_vz", "cov_vz_vz")
 _MAX_JSON_BYTES = 2**24
 _SUMMARY = "summary.json"
-_STALE = ("features/[0-9]*.png", "features.gif", "features.mp4", *(f"{t}.{e}" for t in TABLES for e in ENDINGS))
+UNFINISHED = "unfinished"
+"""Folder within it, for a run that is not done; see `unfinished.py`."""
+_PATHS = ("robot_tum.txt", "robot_kitti.txt", "camera_tum.txt", "camera_kitti.txt")
+_FILES = (*_PATHS, "landmarks.ply", "path.png", _SUMMARY)
+_STALE = (f"features/{'[0-9]' * 6}.png", "features.gif", "features.mp4", *(f"{t}.{e}" for t in TABLES for e in ENDINGS))
 
 
 class RunFolder(NamedTuple):
@@ -71,6 +75,33 @@ def camera_poses(info: FrameInfo) -> Float[np.ndarray, "T 7"]:
     return camera_of_robot(*np.split(np.asarray(info.vehicle), 2, axis=1))
 
 
+def run_files(folder: Path) -> list[Path]:
+    """What lies in a folder under the names of a run's files, in order; a run that is written there replaces it."""
+    return sorted({path for pattern in (*_FILES, *_STALE) for path in folder.glob(pattern)})
+
+
+def check_place(folder: Path, read: Iterable[Path | None] = ()) -> None:
+    """Refuse a folder that a run cannot be written to, or in which it would replace what no run has written.
+
+    Args:
+        folder: for the run; there may be a run already, done or not.
+        read: files that the run is made of.
+
+    Raises:
+        OSError: naming the file that is in the way, and the remedy.
+    """
+    read = [*read]
+    lying = run_files(folder)
+    for path in (folder / _SUMMARY, folder / "features" / "000000.png", folder / UNFINISHED / "state.npz", *lying):
+        check_writable(path, read)
+    is_begun = (folder / UNFINISHED / "state.npz").is_file() or any(folder.glob(".filling.*.tmp"))
+    if lying and not is_begun and not _is_run(folder):
+        raise FileExistsError(
+            f"{lying[0]} is in the way of the run's, and no run has written it: {folder} holds no {_SUMMARY} of one. "
+            f"Give another directory, or move it away ({len(lying)} such files)."
+        )
+
+
 @contextlib.contextmanager
 def new_run(
     folder: Path,
@@ -84,7 +115,7 @@ def new_run(
     """Write the files of a run into a folder, with those that the block writes into the one that it is given.
 
     They get to `folder` when the block ends, the summary last. If anything fails what is there stays. Files of an
-    earlier run give way; others stay.
+    earlier run give way; others stay (see `check_place`).
 
     Raises:
         ValueError: if the run has numbers that are not finite.
@@ -130,17 +161,7 @@ def read_run(folder: str | os.PathLike) -> RunFolder:
         ValueError: naming file and place of what cannot be read.
     """
     folder = Path(folder)
-    path = folder / _SUMMARY
-    if not path.is_file():
-        raise FileNotFoundError(f"{folder}: no complete run here ({_SUMMARY} lacks); run `vcjax run` first.")
-    try:
-        if path.stat().st_size > _MAX_JSON_BYTES:
-            raise ValueError("too large")
-        summary = json.loads(path.read_text("utf-8"))
-        if not isinstance(summary, dict):
-            raise ValueError("no JSON object")
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: no summary of a run ({error}).") from error
+    summary = _read_summary(folder)
     time_s, robot = read_tum(folder / "robot_tum.txt")
     kinds: dict[str, Kind] = {
         "track_id": "whole",
@@ -154,3 +175,26 @@ def read_run(folder: str | os.PathLike) -> RunFolder:
     found.refuse_where(np.diff(found["track_id"], prepend=-1) <= 0, "track_id", "is not above the one before")
     counts = np.column_stack([found[name] for name in VERDICTS])
     return RunFolder(time_s, robot, TrackVerdicts(found["track_id"], counts, *(found[n] for n in _MARGINS)), summary)
+
+
+def _read_summary(folder: Path) -> dict[str, Any]:
+    path = folder / _SUMMARY
+    if not path.is_file():
+        raise FileNotFoundError(f"{folder}: no complete run here ({_SUMMARY} lacks); run `vcjax run` first.")
+    try:
+        if path.stat().st_size > _MAX_JSON_BYTES:
+            raise ValueError("too large")
+        summary = json.loads(path.read_text("utf-8"))
+        if not isinstance(summary, dict):
+            raise ValueError("no JSON object")
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: no summary of a run ({error}).") from error
+    return summary
+
+
+def _is_run(folder: Path) -> bool:
+    """Whether the summary in a folder is a run's, by what every one of them holds."""
+    try:
+        return {"recording", "frames", "first_failure"} <= {*_read_summary(folder)}
+    except (ValueError, OSError):
+        return False

@@ -12,10 +12,10 @@ Arrays are told by their place in the tree that the filter makes (`jax.tree.leav
 with it. A run that takes less than `EVERY_S` leaves nothing.
 """
 
+import contextlib
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -122,8 +122,11 @@ class Unfinished:
 
     def remove(self) -> None:
         """The run is done, and its results are elsewhere. The state goes first: without it the rest counts nothing."""
-        (self.folder / _STATE).unlink(missing_ok=True)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        for pattern in (_STATE, _SETTINGS, "frames_*.npz", ".*.tmp"):
+            for path in self.folder.glob(pattern):
+                path.unlink()
+        with contextlib.suppress(OSError):  # there was none, or it holds what is somebody else's
+            self.folder.rmdir()
 
     def _frames(self, first: int) -> Path:
         return self.folder / f"frames_{first:06d}.npz"
