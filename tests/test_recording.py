@@ -180,3 +180,24 @@ def test_last_sightings_are_those_that_nothing_follows(seed):
             expected[t, j] = is_valid[t, j] and not np.any(is_valid[t + 1 :] & (track_id[t + 1 :] == track_id[t, j]))
     np.testing.assert_array_equal(last_sightings(track_id, is_valid), expected)
     np.testing.assert_array_equal(last_sightings(jnp.array(track_id), jnp.array(is_valid)), expected)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+@pytest.mark.parametrize("name", [None, "uv_px", "odometry_cov", "sensor_shift_m", "time_s"])
+def test_frames_are_in_working_precision_whatever_is_stored(recording, name, dtype):
+    """One field in another precision, as OpenCV gives pixels, or all: the filter sees none of it."""
+    names = [field.name for field in dataclasses.fields(recording) if field.name != "camera"]
+    stored = {n: np.asarray(getattr(recording, n)) for n in names if name in (None, n)}
+    stored = {n: a.astype(dtype) if a.dtype.kind == "f" else a for n, a in stored.items()}
+    found, expected = dataclasses.replace(recording, **stored).frame(1), recording.frame(1)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_allclose(one, other, rtol=2 * np.finfo(dtype).eps, atol=1e-3)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.skipif(np.longdouble(0).itemsize == 8, reason="there is no larger number here")
+def test_numbers_of_more_than_64_bits_are_refused(recording):
+    bad = changed(recording, "uv_px", np.asarray(recording.uv_px, np.longdouble))
+    with pytest.raises(ValueError, match=r"Recording\(uv_px\) is float128; give numbers of at most 64 bits"):
+        validate(bad)

@@ -80,9 +80,10 @@ class Recording(eqx.Module):
         return jnp.diff(jnp.asarray(self.time_s), prepend=jnp.asarray(self.time_s)[:1])
 
     def frame(self, t: int | Int[Array, ""]) -> Frame:
-        """Frame t, 0 ≤ t < T."""
+        """Frame t, 0 ≤ t < T, in the precision that a run works in, whatever the recording is stored in."""
         per_frame = (f.name for f in dataclasses.fields(Frame) if f.name != "camera")
-        return Frame(camera=self.camera, **{name: jnp.asarray(getattr(self, name))[t] for name in per_frame})
+        frame = Frame(camera=self.camera, **{name: jnp.asarray(getattr(self, name))[t] for name in per_frame})
+        return jax.tree.map(in_working_precision, frame)
 
 
 PER_FRAME = ("time_s", "odometry", "odometry_cov", "sensor_shift_m", "track_id", "uv_px", "is_valid", "is_last")
@@ -100,6 +101,12 @@ class Truth(eqx.Module):
     """Place of every feature in each frame; feature number = track id."""
     is_moving: Bool[AnyArray, " F"]
     """Whether a feature moves at any time."""
+
+
+def in_working_precision(leaf: AnyArray) -> Array:
+    """An array on the device; of floating-point numbers, in JAX's own precision: float64, or float32 without x64."""
+    leaf = jnp.asarray(leaf)
+    return leaf.astype(jnp.result_type(float)) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
 
 def moves_in_frame(truth: Truth) -> Bool[Array, "T F"]:
@@ -216,6 +223,8 @@ def _refuse_types(recording: Recording) -> None:
         }.get(name, (jnp.floating, "give floating-point numbers"))
         if not jnp.issubdtype(value.dtype, kind):
             raise ValueError(f"Recording({name}) is {value.dtype}; {needed}.")
+        if value.dtype.itemsize > 8:
+            raise ValueError(f"Recording({name}) is {value.dtype}; give numbers of at most 64 bits.")
     require_kind("Recording", "camera", recording.camera, Camera, "give a vcjax.Camera.")
 
 

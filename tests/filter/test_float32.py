@@ -3,6 +3,7 @@
 JAX's precision is one switch for a process, so that this run has one of its own.
 """
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -14,6 +15,7 @@ import numpy as np
 from filter_runs import CAPACITY, QUICK, filtered, head, recorded
 
 from vcjax.filter.config import FilterConfig
+from vcjax.filter.run import run
 
 NUM_FRAMES = 30
 ROOT = Path(__file__).parents[2]
@@ -69,3 +71,14 @@ def test_float32_is_near_float64(tmp_path):
     std32 = np.sqrt(np.maximum(np.diagonal(ours["vehicle_cov"], axis1=1, axis2=2), 0))
     np.testing.assert_allclose(std32, std, rtol=0, atol=1e-4)
     assert abs(ours["num_accepted"] - theirs.is_accepted.sum()) <= 3
+
+
+def test_recordings_in_single_precision_run_in_double():
+    """Each field by itself, and all: traced only, as the types tell."""
+    recording = head(recorded(seed=6, dynamic="lateral", oscillation_amplitude_m=0.05), 2)
+    single = {name: np.float32(a) for name, a in vars(recording).items() if name != "camera" and a.dtype == np.float64}
+    config = FilterConfig(max_landmarks=CAPACITY, retire=False)
+    expected = jax.eval_shape(lambda r: run(config, r), recording)
+    for fields in ({"uv_px"}, {"robot_start"}, {"odometry", "time_s"}, {*single}):
+        changed = dataclasses.replace(recording, **{name: single[name] for name in fields})
+        assert jax.eval_shape(lambda r: run(config, r), changed) == expected, fields

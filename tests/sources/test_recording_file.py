@@ -173,6 +173,10 @@ BAD = {
     "images too few": ({"image_path.npy": npy(["a.png"])}, "1 images for 5 frames"),
     "bad calibration": ({"calibration.npy": npy("{}")}, "calibration: lacks width, height, fx"),
     "text beyond Unicode": ({"calibration.npy": header((), "<U1") + b"\xff\xff\xff\x7f"}, "calibration is no text"),
+    "more than 64 bits": (
+        {"truth_robot.npy": npy(np.zeros((5, 7), np.longdouble))},
+        "truth_robot is float128; numbers",
+    ),
     "empty header": ({"uv_px.npy": b""}, "uv_px has no readable header"),
     "words for a header": ({"uv_px.npy": b"\x93NUMPY\x01\x00\x10\x00" + b"import os".ljust(16)}, "no readable header"),
     "negative length": ({"uv_px.npy": header((-1, 2))}, r"no readable header .*shape \(-1, 2\)"),

@@ -24,7 +24,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.filter.follower import Followers, nobody
 from vcjax.filter.map_covariance import SLOT, SLOTS_PER_BLOCK, slot_blocks, symmetric
 from vcjax.models.frames import unit
-from vcjax.recording import Recording
+from vcjax.recording import Recording, in_working_precision
 
 VEHICLE = 14
 """Error coordinates of robot and sensor; the motion model may add some of its own behind them."""
@@ -98,7 +98,7 @@ def initial_state(config: FilterConfig, recording: Recording, key: PRNGKeyArray 
             f"(FilterConfig(birth_order={config.birth_order!r}))."
         )
     num_slots = slot_count(config)
-    poses = (jnp.asarray(recording.robot_start), jnp.asarray(recording.sensor_start))
+    poses = (in_working_precision(recording.robot_start), in_working_precision(recording.sensor_start))
     vehicle = jnp.concatenate([part for pose in poses for part in (pose[:3], unit(pose[3:]))])
     dtype = vehicle.dtype
     P_vv = jnp.asarray(recording.start_cov, dtype)

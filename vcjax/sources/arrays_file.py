@@ -102,6 +102,8 @@ def _headers(path: Path, archive: zipfile.ZipFile, kinds: Mapping[str, str]) -> 
             stated = member.file_size - file.tell()
         if header.dtype.kind not in kinds[name]:
             raise ValueError(f"{path}: {name} is {header.dtype}; {_NEEDED[kinds[name]]} are needed.")
+        if header.dtype.kind == "f" and header.dtype.itemsize > 8:
+            raise ValueError(f"{path}: {name} is {header.dtype}; numbers of at most 64 bits are needed.")
         if stated != header.num_bytes:
             raise ValueError(
                 f"{path}: {name} has {stated} bytes, but shape {header.shape} of {header.dtype} has {header.num_bytes}."

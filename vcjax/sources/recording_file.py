@@ -16,7 +16,7 @@ columns, F of features in the world, L of labelled tracks:
 | `image_path` | (T,) | optional: the image of each frame; relative paths begin at the file's folder |
 | `calibration` | () | optional: the calibration of the images as JSON, see `calibration.py` |
 
-Floating-point numbers may be of any size, and are read as they were written.
+Floating-point numbers may have 16, 32 or 64 bits, and are read as they were written.
 """
 
 import dataclasses
