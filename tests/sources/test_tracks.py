@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from test_recording import good_recording
 
-from vcjax.recording import last_sightings, validate
+from vcjax.recording import PER_FRAME, last_sightings, validate
 from vcjax.sources import tracks as module
 from vcjax.sources.calibration import Calibration, write_calibration
 from vcjax.sources.odometry import AXES, from_velocities, unknown_motion
@@ -115,9 +116,28 @@ def test_bad_recordings_are_refused(monkeypatch):
         make(tracks)
     with pytest.raises(ValueError, match="frame 0 has id 1 twice"):
         make(Tracks(np.array([0, 0]), np.array([1, 1]), np.zeros((2, 2))))
-    monkeypatch.setattr(module, "MAX_ENTRIES", 20)
-    with pytest.raises(ValueError, match="12 frames of up to 2 features are more than 20 entries; cut"):
+    monkeypatch.setattr(module, "MAX_BYTES", 2**12)
+    with pytest.raises(ValueError, match="12 frames of up to 2 features need 0 MiB of memory, more than 0; number"):
         make(Tracks(np.array([0, 0]), np.array([1, 2]), np.zeros((2, 2))))
+
+
+def test_a_far_frame_takes_no_memory(tmp_path):
+    """42 bytes of a table: each frame that nothing is seen in takes its covariance, too."""
+    (tmp_path / "a.csv").write_text("frame,track_id,u,v\n0,1,2,3\n33554430,1,2,3\n")
+    write_calibration(tmp_path / "c.json", CALIBRATION)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"a\.csv: frame 33554430 is the last: 33554431 frames .* need 13632 MiB"):
+        read_recording(tmp_path / "a.csv", tmp_path / "c.json", rate_hz=10.0)
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
+
+
+def test_what_a_recording_takes_is_counted():
+    """Per frame and per column, from the arrays themselves."""
+    one, two = (make(Tracks(np.zeros(n, int), np.arange(n), np.zeros((n, 2)))) for n in (1, 2))
+    needed = [sum(getattr(r, name).nbytes for name in PER_FRAME) / r.num_frames for r in (one, two)]
+    assert needed[1] - needed[0] == module._ENTRY_BYTES
+    assert needed[0] - module._ENTRY_BYTES <= module._FRAME_BYTES
 
 
 HEADER = "frame,track_id,u,v\n"

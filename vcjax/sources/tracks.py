@@ -21,8 +21,10 @@ from vcjax.sources.distortion import bend, pinhole, straighten
 from vcjax.sources.odometry import Odometry, read_odometry, unknown_motion
 from vcjax.sources.table_file import Table, read_table, write_table
 
-MAX_ENTRIES = 2**25
-"""Most entries (frames × features in the fullest frame) of a recording made here: about 0.7 GB."""
+MAX_BYTES = 2**30
+"""Most memory that a recording made here may take: more than an hour of 200 features at 30 Hz."""
+_FRAME_BYTES, _ENTRY_BYTES = 400, 26
+"""What a frame takes, with its covariance of the odometry, and each of its columns for features."""
 
 ORIGIN = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -118,7 +120,7 @@ def recording_from_tracks(
         start_cov: covariance of robot and sensor pose there; zero.
 
     Raises:
-        ValueError: for a frame beyond the last, for more than `MAX_ENTRIES` entries, or what `validate` refuses.
+        ValueError: for a frame beyond the last, for more than `MAX_BYTES`, or what `validate` refuses.
     """
     num_frames = len(time_s)
     frame, track_id = np.asarray(tracks.frame, np.int64), np.asarray(tracks.track_id, np.int64)
@@ -131,11 +133,7 @@ def recording_from_tracks(
 
     per_frame = np.bincount(frame, minlength=num_frames)
     num_columns = max(1, int(per_frame.max()))
-    if num_frames * num_columns > MAX_ENTRIES:
-        raise ValueError(
-            f"recording_from_tracks(tracks): {num_frames} frames of up to {num_columns} features are more than "
-            f"{MAX_ENTRIES} entries; cut the sequence, or thin its fullest frames."
-        )
+    _refuse_size("recording_from_tracks(tracks)", num_frames, num_columns)
     column = np.arange(len(frame)) - np.repeat(np.cumsum(per_frame) - per_frame, per_frame)
     shape = (num_frames, num_columns)
     ids, pixels, is_valid = np.zeros(shape, np.int64), np.zeros((*shape, 2)), np.zeros(shape, bool)
@@ -224,8 +222,7 @@ def read_recording(
     else:
         tracks = read_tracks(tracks_file)
         num_frames = int(tracks.frame.max()) + 1 if len(tracks.frame) else 1
-        if num_frames > MAX_ENTRIES:
-            raise ValueError(f"{tracks_file}: frame {num_frames - 1} is the last; number frames from 0, without gaps.")
+        _refuse_size(f"{tracks_file}: frame {num_frames - 1} is the last", num_frames, 1)
         frames = np.arange(num_frames)
         time_s = frames / float(rate_hz or 1.0)
     if odometry_file is not None:
@@ -238,3 +235,14 @@ def _refuse_bad_numbers(table: Table, names: tuple[str, ...]) -> None:
     for name in names:
         table.refuse_where(table[name] < 0, name, "is below 0")
         table.refuse_where(table[name] >= 2**31, name, "does not fit in 31 bits; number them from 0")
+
+
+def _refuse_size(what: str, num_frames: int, num_columns: int) -> None:
+    """Refuse a recording that would take more than `MAX_BYTES`, before it is made."""
+    needed = num_frames * (_FRAME_BYTES + num_columns * _ENTRY_BYTES)
+    if needed > MAX_BYTES:
+        raise ValueError(
+            f"{what}: {num_frames} frames of up to {num_columns} features need {needed / 2**20:.0f} MiB of memory, "
+            f"more than {MAX_BYTES / 2**20:.0f}; number frames from 0 without gaps, cut the sequence, or thin its "
+            "fullest frames."
+        )
