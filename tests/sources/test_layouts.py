@@ -1,5 +1,7 @@
 """Layouts of data sets: small ones made here are read as they were meant, bad ones refused by file and line."""
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -46,8 +48,8 @@ BAD_TUM = {
     "NaN": ("# a\nnan rgb/0.png\n", r"rgb\.txt, line 2: 'nan' is not"),
     "out": ("100.0 ../secret.png\n", r"line 1: '\.\./secret\.png' leads out of the data set"),
     "absolute": ("100.0 /etc/passwd\n", "line 1: '/etc/passwd' leads out"),
-    "back": ("100.0 rgb/0.png\n99.0 rgb/1.png\n", r"99\.0 s, of .*rgb/1\.png, is not above that of the image before"),
-    "none": ("# nothing\n", "no image; give at least one"),
+    "back": ("100.0 rgb/0.png\n# a\n99.0 rgb/1.png\n", r"rgb\.txt, line 3: time 99\.0 s is not above the one before"),
+    "none": ("# nothing\n", r"rgb\.txt: no line; give the time of each image"),
 }
 
 
@@ -120,6 +122,7 @@ BAD_EUROC = {
     "no rotation": ("0.0, -1.0, 0.0", "0.0, -2.0, 0.0", r"sensor\.yaml, T_BS: its 3 × 3 part is no rotation"),
     "no YAML": ("resolution: [64", "resolution: [64 }", "needed are resolution"),
     "object": ("cam0 (MT9M034)", "\nx: !!python/object/apply:os.system ['false']", "ConstructorError"),
+    "aliases": ("  cols: 4\n", "  cols: &a [0.0]\n  rest: [*a, *a]\n", r"sensor\.yaml: ValueError an alias \(\*\)"),
     "coefficients": (", 0.00019359, 1.76187114e-05", "", r"Calibration\(distortion=.*: give 4 or 5 or 8"),
 }
 
@@ -147,6 +150,30 @@ def test_bad_euroc_tables_are_refused_by_line(asl):
     (asl / "mav0/cam0/data.csv").write_text("#timestamp [ns],filename\n14036.5,a.png\n")
     with pytest.raises(ValueError, match=r"cam0/data\.csv, line 2: a time in ns and a file are needed"):
         euroc(asl)
+    for content, message in (
+        (f"{'9' * 400},a.png\n", "data\\.csv, line 1: a time in ns and a file are needed"),
+        ("2000000000,a.png\n# a\n1000000000,b.png\n", "data\\.csv, line 3: time 1.0 s is not above the one before"),
+        ("# nothing\n", "data\\.csv: no line; give the time of each image"),
+    ):
+        (asl / "mav0/cam0/data.csv").write_text(content)
+        with pytest.raises(ValueError, match=message):
+            euroc(asl)
+
+
+def test_nested_aliases_take_no_memory(asl):
+    """Ten lines of ten aliases each stand for 10¹⁰ numbers."""
+    nested = "".join(f"k{i}: &k{i} [{', '.join([f'*k{i - 1}'] * 10)}]\n" for i in range(1, 10))
+    bomb = (
+        "k0: &k0 [1.0, 1.0]\n"
+        + nested
+        + SENSOR.replace(SENSOR[SENSOR.index("[0.0, -1.0") : SENSOR.index("rate")], "*k9\n")
+    )
+    (asl / "mav0/cam0/sensor.yaml").write_text(bomb)
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"sensor\.yaml: ValueError an alias"):
+        euroc(asl)
+    assert tracemalloc.get_traced_memory()[1] < 2**24
+    tracemalloc.stop()
 
 
 @pytest.fixture
@@ -160,6 +187,19 @@ def kitti(tmp_path):
     (tmp_path / "poses").mkdir()
     write_kitti(tmp_path / "poses" / "07.txt", poses_at(np.array([0.0, 1, 2, 3])))
     return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("calib.txt", "P0: 50", "P0: 0", r"calib\.txt, line 1: Calibration\(fx=0\.0\): a focal length is positive"),
+        ("times.txt", "2.08e-01", "0.1", r"times\.txt, line 3: time 0\.1 s is not above the one before"),
+    ],
+)
+def test_bad_kitti_files_are_refused_by_line(kitti, name, old, new, message):
+    (kitti / name).write_text((kitti / name).read_text().replace(old, new, 1))
+    with pytest.raises(ValueError, match=message):
+        kitti_odometry(kitti)
 
 
 def test_kitti_odometry(kitti):
@@ -204,7 +244,7 @@ def test_plain_folder(tmp_path, inner):
     [
         [f"{t}.png" for t in range(12)],
         [f"b2_{t:02d}.png" for t in range(9, 12)],
-        ["1305031102.175304.png", "1305031102.5.png", "1305031103.0.png"],  # times
+        ["1305031102.175304.png", "1305031102.500000.png", "1305031103.000000.png"],  # times
         ["1403636579763555584.png", "1403636579763555585.png", "1403636580000000000.png"],
         ["01.jpg", "1.PNG", "1a.png", "a.png"],
         ["left-1.png", "left-2.png", "left-10.png", "right-1.png"],
@@ -215,6 +255,22 @@ def test_images_come_in_the_order_of_the_numbers_in_their_names(tmp_path, names)
         (tmp_path / name).write_bytes(b"")
     found = [path.name for path in plain_folder(tmp_path, CALIBRATION, 1.0).paths]
     assert found == names
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ([f"cam0.{t}.png" for t in range(12)], r"cam0\.2\.png or cam0\.10\.png\?"),
+        (["1305031102.175304.png", "1305031102.5.png"], r"1305031102\.5\.png or 1305031102\.175304\.png\?"),
+    ],
+)
+def test_an_order_that_the_names_leave_open_is_refused(tmp_path, names, words):
+    """A point between two whole numbers, or before decimals: nobody can tell."""
+    for name in names:
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(ValueError, match=f"which comes first, {words} .* same count of digits") as refusal:
+        plain_folder(tmp_path, CALIBRATION, 1.0)
+    assert str(tmp_path) in str(refusal.value)
 
 
 def test_folders_without_what_is_needed(tmp_path):

@@ -5,7 +5,9 @@ Each reader gives an `ImageSequence`. Names in the files are taken only if they 
 
 import os
 import re
+from collections.abc import Sequence
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,8 @@ from vcjax.sources.trajectory_file import poses_of, read_kitti, read_numbers, re
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 _MAX_YAML_BYTES = 2**20
+_MAX_DIGITS = 19
+"""Of a time in ns: what 64 bits hold."""
 
 
 def tum_rgbd(folder: str | os.PathLike, calibration: Calibration) -> ImageSequence:
@@ -40,6 +44,7 @@ def tum_rgbd(folder: str | os.PathLike, calibration: Calibration) -> ImageSequen
             raise ValueError(f"{place}: {len(row)} words; a time and a file are needed.")
         times.append(_number(row[0], place))
         paths.append(_inside(folder, row[1], place))
+    _refuse_times(folder / "rgb.txt", lines, times)
     truth = None
     if (folder / "groundtruth.txt").exists():
         truth = PoseTruth(*read_tum(folder / "groundtruth.txt"), of="camera")
@@ -66,10 +71,11 @@ def euroc(folder: str | os.PathLike, camera: str = "cam0") -> ImageSequence:
     for line, row in zip(lines, rows, strict=True):
         place = f"{folder / camera / 'data.csv'}, line {line}"
         cells = [cell.strip() for cell in "".join(row).split(",")]
-        if len(cells) != 2 or not cells[0].isdecimal():
+        if len(cells) != 2 or not cells[0].isdecimal() or len(cells[0]) > _MAX_DIGITS:
             raise ValueError(f"{place}: a time in ns and a file are needed, with a comma between them.")
         times.append(int(cells[0]) * 1e-9)
         paths.append(_inside(folder / camera / "data", cells[1], place))
+    _refuse_times(folder / camera / "data.csv", lines, times)
     truth, states = None, folder / "state_groundtruth_estimate0" / "data.csv"
     if states.exists():
         table = _euroc_states(states)
@@ -93,7 +99,9 @@ def kitti_odometry(folder: str | os.PathLike, camera: int = 0, poses: str | os.P
     """
     folder = _folder(folder)
     paths = _images(folder / f"image_{camera}")
-    times = read_numbers(folder / "times.txt", 1)[0][:, 0]
+    times, lines = read_numbers(folder / "times.txt", 1)
+    times = times[:, 0]
+    _refuse_times(folder / "times.txt", lines, times)
     lines, rows = read_words(folder / "calib.txt")
     found = {row[0].rstrip(":"): (line, row[1:]) for line, row in zip(lines, rows, strict=True)}
     if f"P{camera}" not in found:
@@ -104,7 +112,10 @@ def kitti_odometry(folder: str | os.PathLike, camera: int = 0, poses: str | os.P
         raise ValueError(f"{place}: {len(words)} numbers; P{camera} has 12.")
     P = np.array([_number(word, place) for word in words]).reshape(3, 4)
     width, height = image_size(paths[0])
-    calibration = Calibration(width, height, float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]))
+    try:
+        calibration = Calibration(width, height, float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]))
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
     if len(times) < len(paths):
         raise ValueError(f"{folder / 'times.txt'}: {len(times)} times for {len(paths)} images.")
     times = times[: len(paths)]
@@ -162,16 +173,33 @@ def _folder(folder: str | os.PathLike) -> Path:
 
 def _images(folder: Path) -> list[Path]:
     found = (path for path in _folder(folder).iterdir() if not path.name.startswith("."))
-    paths = sorted((path for path in found if path.suffix.lower() in IMAGE_ENDINGS), key=_by_numbers)
+    paths = [path for path in found if path.suffix.lower() in IMAGE_ENDINGS]
     if not paths:
         raise FileNotFoundError(f"{folder}: no image in it ({', '.join(IMAGE_ENDINGS)}).")
-    return paths
+    by_whole, by_decimal = (sorted(paths, key=partial(_by_numbers, number=n)) for n in (_WHOLE, _DECIMAL))
+    for one, other in zip(by_whole, by_decimal, strict=True):
+        if one != other:
+            raise ValueError(
+                f"{folder}: which comes first, {one.name} or {other.name}? With whole numbers the one, with decimals "
+                "the other; give these numbers the same count of digits in every name."
+            )
+    return by_whole
 
 
-def _by_numbers(path: Path) -> tuple[list[str | Decimal], str]:
-    """The key of a name whose numbers, whole or with decimals, count as numbers: 2 before 10, and 1.175 before 1.5."""
-    parts = re.split(r"(\d+(?:\.\d+)?)", path.stem)
-    return [Decimal(part) if i % 2 else part for i, part in enumerate(parts)], path.name
+_WHOLE, _DECIMAL = r"(\d+)", r"(\d+(?:\.\d+)?)"
+
+
+def _by_numbers(path: Path, number: str) -> tuple[list[str | Decimal], str]:
+    """The key of a name in which a pattern of numbers counts as numbers: 2 before 10."""
+    return [Decimal(part) if i % 2 else part for i, part in enumerate(re.split(number, path.stem))], path.name
+
+
+def _refuse_times(path: Path, lines: Sequence[int] | np.ndarray, times: Sequence[float] | np.ndarray) -> None:
+    """Refuse a list without images, or with times that do not grow, by its line."""
+    if not len(times):
+        raise ValueError(f"{path}: no line; give the time of each image.")
+    if len(bad := np.flatnonzero(~(np.diff(times) > 0))):
+        raise ValueError(f"{path}, line {lines[bad[0] + 1]}: time {times[bad[0] + 1]} s is not above the one before.")
 
 
 def _inside(folder: Path, name: str, place: str) -> Path:
@@ -218,7 +246,10 @@ def _euroc_calibration(path: Path) -> Calibration:
     if path.stat().st_size > _MAX_YAML_BYTES:
         raise ValueError(f"{path}: larger than a calibration can be ({_MAX_YAML_BYTES} bytes).")
     try:
-        found = yaml.safe_load(path.read_text("utf-8"))
+        text = path.read_text("utf-8")
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise ValueError("an alias (*), of which a few can stand for any number of values; write values out")
+        found = yaml.safe_load(text)
         width, height = found["resolution"]
         fx, fy, cx, cy = (float(x) for x in found["intrinsics"])
         model = {"radial-tangential": "radial_tangential", "equidistant": "equidistant"}[found["distortion_model"]]
