@@ -69,6 +69,8 @@ BAD_CSV = {
     "long row": ("frame,u\n1,0.5\n2,3,4\n", "line 3: 3 cells, but"),
     "empty line": ("frame,u\n1,0.5\n\n2,0.5\n", "line 3(: 1 cells|, column frame: '' is)"),
     "long word": ("frame,u\n1," + "x" * 1000 + "\n", "column u: 'x{37}…' is not"),
+    "carriage returns": ("frame,u\r1,0.5\r", r"a\.csv: its lines end with carriage returns alone"),
+    "long header": ("frame,u," + "x" * 2**16 + "\n1,0.5,0\n", r"a\.csv, line 1: longer than 65536 bytes"),
     "no text": (b"\xff\xfe\x00\n", r"a\.csv: 'utf-8' codec"),
     "zeros": (b"\x00" * 100, r"a\.csv: "),
 }
@@ -89,7 +91,11 @@ BAD_PARQUET = {
     "fractions": ({"frame": [1.0], "u": [1.0]}, "column frame: of type double; store a whole number"),
     "hole": ({"frame": [1, 2, None], "u": [1.0, 2.0, 3.0]}, "row 3, column frame: empty; each row needs a whole"),
     "NaN": ({"frame": [1, 2], "u": [1.0, np.nan]}, "row 2, column u: nan is not finite"),
-    "too large": ({"frame": pa.array([2**63], pa.uint64()), "u": [1.0]}, "9223372036854775808"),
+    "too large": ({"frame": pa.array([2**63], pa.uint64()), "u": [1.0]}, "row 1, column frame: 9223372036854775808 is"),
+    "no double": (
+        {"frame": [1, 2], "u": pa.array([1, 2**60 + 1])},
+        "row 2, column u: 1152921504606846977 is too large",
+    ),
 }
 
 
@@ -118,6 +124,19 @@ def test_damaged_parquet_is_refused(tmp_path):
         path.write_bytes(whole[:length])
         with pytest.raises(ValueError, match=r"a\.parquet: "):
             read_table(path, KINDS)
+
+
+def test_every_flipped_byte_of_a_parquet_file_is_refused_by_name_or_read(tmp_path):
+    path = write_table(tmp_path / "a.parquet", {"frame": np.arange(50), "u": np.random.default_rng(0).random(50)})
+    whole, refused = path.read_bytes(), 0
+    for place in range(0, len(whole), 7):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        try:
+            read_table(path, KINDS)
+        except ValueError as error:
+            refused += 1
+            assert "a.parquet" in str(error), error
+    assert refused > 20
 
 
 def test_parquet_that_states_too_many_rows_takes_no_memory(tmp_path):

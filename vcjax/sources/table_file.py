@@ -78,7 +78,9 @@ def read_table(
     arrow = extras.load("pyarrow", "Tables", "images")
     try:
         columns = read(path, kinds, optional)
-    except (arrow.ArrowException, UnicodeDecodeError) as error:
+    except (arrow.ArrowException, UnicodeDecodeError, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # of the system, which names the file
+            raise
         raise ValueError(f"{path}: {_first_line(error)}") from error
     table = Table(path, columns)
     for name, column in columns.items():
@@ -119,6 +121,10 @@ def _read_csv(path: Path, kinds: Mapping[str, Kind], optional: Sequence[str]) ->
     arrow = extras.load("pyarrow", "Tables", "images")
     with path.open("rb") as file:
         line = file.readline(_MAX_HEADER_BYTES)
+    if len(line) == _MAX_HEADER_BYTES and not line.endswith(b"\n"):
+        raise ValueError(f"{path}, line 1: longer than {_MAX_HEADER_BYTES} bytes; a table begins with its header.")
+    if b"\r" in line.rstrip(b"\r\n"):
+        raise ValueError(f"{path}: its lines end with carriage returns alone; save it with line feeds.")
     names = [name.strip() for name in next(csv.reader([line.decode("utf-8-sig")]), [])]
     found = _choose(path, names, kinds, optional)
     if not line.endswith(b"\n"):
@@ -188,7 +194,13 @@ def _read_parquet(path: Path, kinds: Mapping[str, Kind], optional: Sequence[str]
             row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
             raise ValueError(f"{path}, row {row + 1}, column {name}: empty; each row needs {_WANTED[kinds[name]]}.")
         wide = arrow.int64() if kinds[name] == "whole" else arrow.float64()
-        columns[name] = column.cast(wide).to_numpy(zero_copy_only=False)
+        try:
+            columns[name] = column.cast(wide).to_numpy(zero_copy_only=False)
+        except arrow.ArrowInvalid as error:
+            values, limit = column.to_numpy(zero_copy_only=False), 2**63 - 1 if kinds[name] == "whole" else 2**53
+            row = int(np.flatnonzero((values > limit) | (values < -limit))[0])
+            place = f"{path}, row {row + 1}, column {name}"
+            raise ValueError(f"{place}: {values[row]} is too large for {_WANTED[kinds[name]]} of 64 bits.") from error
     return columns
 
 
