@@ -79,6 +79,12 @@ def test_run_takes_a_key_for_births_in_random_order_only(recording):
 
 
 BAD_CONFIGURATIONS = {
+    "more slots than memory": (
+        dict(max_landmarks=10**12),
+        r"FilterConfig\(max_landmarks=1000000000000\): give at most",
+    ),
+    "endless births": (dict(births_per_frame=10**12), r"births_per_frame=1000000000000\): give at most 8192"),
+    "endless blacklist": (dict(blacklist_capacity=10**12), r"blacklist_capacity=1000000000000\): give at most 1048576"),
     "no slot": (dict(max_landmarks=0), r"FilterConfig\(max_landmarks=0.*at least 1"),
     "no update": (dict(max_updates=0), r"FilterConfig\(max_updates=0.*at least 1"),
     "more updates than slots": (

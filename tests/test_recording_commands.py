@@ -382,6 +382,7 @@ def test_million_rows_with_one_bad_cell(tmp_path, ending, place):
         ("run {recording} --known-std-m 0", ["--known-std-m 0.0: give a positive number"]),
         ("run {recording} --known-distance 0 1 2", ["the scale of this run is known from odometry"]),
         ("track folder --start-std-m -1", ["--start-std-m -1.0: a standard deviation is at least 0"]),
+        ("run {recording} --max-landmarks 1000000000000", ["FilterConfig(max_landmarks=1000000000000): give at most"]),
         ("run {recording} --th1 -1", ["VirtualCorrection(th1=-1.0)"]),
         ("run {recording} --out file", ["file is a file"]),
         ("run {recording} --pictures -1", ["--pictures -1: give a whole number of at least 0"]),

@@ -77,13 +77,16 @@ def require(
         raise ValueError(f"{owner_name}({name}={shown}): {remedy}")
 
 
-def require_count(owner: object, name: str, minimum: int) -> None:
-    """Refuse a static field that is no whole number, or below a minimum.
+def require_count(owner: object, name: str, minimum: int, maximum: int | None = None) -> None:
+    """Refuse a static field that is no whole number, below a minimum, or above a maximum.
 
     Raises:
         ValueError: naming class, field, value and remedy.
     """
-    require_whole(type(owner).__name__, name, getattr(owner, name), minimum)
+    value = getattr(owner, name)
+    require_whole(type(owner).__name__, name, value, minimum)
+    if maximum is not None and value > maximum:
+        raise ValueError(f"{type(owner).__name__}({name}={value}): give at most {maximum}.")
 
 
 def require_whole(owner: str, name: str, value: object, minimum: int) -> None:

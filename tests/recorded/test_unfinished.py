@@ -93,9 +93,10 @@ def test_another_run_is_refused_and_damage_is_said(tmp_path):
     state.write_bytes(state.read_bytes()[:-100])
     with pytest.raises(ValueError, match=r"state\.npz: not a sound \.npz file"):
         run(folder)
-    (folder / "settings.json").write_text("{")
-    with pytest.raises(ValueError, match=r"settings\.json: not what a run left"):
-        run(folder)
+    for content in ("{", "[" * 100_000):
+        (folder / "settings.json").write_text(content)
+        with pytest.raises(ValueError, match=r"settings\.json: not what a run left"):
+            run(folder)
 
 
 _CHILD = f"""

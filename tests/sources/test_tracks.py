@@ -225,7 +225,7 @@ def test_recording_from_fewest_files(tmp_path):
         with pytest.raises(ValueError, match=message):
             read_recording(*files, **options)
     write_tracks(files[0], Tracks(np.array([2**31 - 1]), np.array([3]), np.zeros((1, 2))))
-    with pytest.raises(ValueError, match=r"t\.csv: frame 2147483647 is the last; number frames from 0"):
+    with pytest.raises(ValueError, match=r"t\.csv: frame 2147483647 is the last: .* number frames from 0"):
         read_recording(*files, rate_hz=1.0)
 
 

@@ -26,6 +26,11 @@ from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.surrogates import SMOOTHINGS, Smoothing
 from vcjax.gates.virtual_correction import VirtualCorrection
 
+MAX_LANDMARKS = 2**13
+"""Most landmark slots: their covariance, of seven numbers each, takes 26 GB in float64."""
+MAX_BLACKLIST = 2**20
+"""Most features that are remembered."""
+
 
 class FilterConfig(eqx.Module):
     """All that shapes a filter run beside its recording. The defaults are the paper's scenario."""
@@ -120,9 +125,10 @@ class FilterConfig(eqx.Module):
         frames = "give a number of frames of at least 0, or infinity: for good."
         require(self, "blacklist_frames", lambda n: n >= 0, frames)
         for name in ("max_landmarks", "max_updates"):
-            require_count(self, name, 1)
-        for name in ("births_first_frame", "births_per_frame", "blacklist_capacity"):
-            require_count(self, name, 0)
+            require_count(self, name, 1, MAX_LANDMARKS)
+        for name in ("births_first_frame", "births_per_frame"):
+            require_count(self, name, 0, MAX_LANDMARKS)
+        require_count(self, "blacklist_capacity", 0, MAX_BLACKLIST)
         for name, choices in (
             ("update", ("sequential", "stacked")),
             ("smoothing", SMOOTHINGS),

@@ -87,7 +87,7 @@ class Unfinished:
         remedy = f"remove {self.folder}, or give another directory for the results."
         try:
             found = json.loads((self.folder / _SETTINGS).read_text("utf-8"))
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, RecursionError) as error:
             raise ValueError(f"{self.folder / _SETTINGS}: not what a run left ({error}); {remedy}") from error
         if not isinstance(found, dict):
             raise ValueError(f"{self.folder / _SETTINGS}: not what a run left; {remedy}")

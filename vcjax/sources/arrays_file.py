@@ -122,7 +122,7 @@ def _header(file: Any) -> Header:
     if read is None:
         raise ValueError(f"version {version} of the .npy format")
     shape, is_fortran, dtype = read(file)
-    if dtype.hasobject or dtype.shape or dtype.names:
+    if dtype.hasobject or dtype.shape or dtype.names or not dtype.itemsize:
         raise ValueError(f"type {dtype}")
     if not all(0 <= length < 2**40 for length in shape):
         raise ValueError(f"shape {shape}")
