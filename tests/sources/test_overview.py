@@ -39,6 +39,12 @@ def test_summary_of_all_that_is_known():
     assert found["images"] == "640 × 480 px, distortion none" and found["image files"].startswith("images/0 ä.png …")
 
 
+def test_names_of_images_obey_nobody():
+    """Neither what clears a terminal nor half a letter, which none can print."""
+    found = said(full()._replace(image_paths=("\x1b[2J.png", *("a.png",) * 3, "\udc80.png")))
+    assert found["image files"] == r"'\x1b[2J.png' … '\udc80.png'"
+
+
 def test_recordings_without_anything():
     recording = good_recording()
     empty = dataclasses.replace(
@@ -49,6 +55,7 @@ def test_recordings_without_anything():
     assert found["odometry"].startswith("none (standard deviations")
     path = draw_overview(empty).axes[3]
     assert not path.lines and path.get_legend() is None and path.texts[0].get_text() == "neither odometry nor truth"
+    assert not path.axison
 
 
 def test_picture_has_the_pixels_of_the_images():

@@ -173,6 +173,7 @@ BAD = {
     "images too few": ({"image_path.npy": npy(["a.png"])}, "1 images for 5 frames"),
     "bad calibration": ({"calibration.npy": npy("{}")}, "calibration: lacks width, height, fx"),
     "text beyond Unicode": ({"calibration.npy": header((), "<U1") + b"\xff\xff\xff\x7f"}, "calibration is no text"),
+    "endless distortion": ({"camera_distortion.npy": npy(np.zeros(9))}, r"Camera\(distortion\) has 9 coefficients"),
     "texts of no length": ({"image_path.npy": header((5,), "<U0")}, "image_path has no readable header"),
     "more than 64 bits": (
         {"truth_robot.npy": npy(np.zeros((5, 7), np.longdouble))},

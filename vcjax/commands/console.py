@@ -47,5 +47,6 @@ def progress_bar(console: Console, description: str) -> Iterator[Callable[..., N
 
 
 def say(console: Console, text: str, style: str | None = None) -> None:
-    """Print a line as it is, without markup and never broken."""
+    """Print a line as it is, without markup and never broken; what a terminal would obey is written out."""
+    text = "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
     console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)

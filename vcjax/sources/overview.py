@@ -58,7 +58,7 @@ def summary(content: Recording | RecordingFile) -> str:
         counts = [f"{np.sum(labels.label == label)} {label.name.lower()}" for label in TrackLabel]
         rows.append(("labels", ", ".join(counts)))
     if image_paths is not None:
-        rows.append(("image files", f"{image_paths[0]} … {image_paths[-1]}"))
+        rows.append(("image files", f"{_shown(image_paths[0])} … {_shown(image_paths[-1])}"))
     rows += [("warning", text) for text in warnings(recording)]
     return "\n".join(f"{name:15s} {text}" for name, text in rows)
 
@@ -90,6 +90,7 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     (seen, lengths), (image, path) = figure.subplots(2, 2)
 
     seen.plot(time_s, np.sum(np.asarray(recording.is_valid), axis=1), color=_BLUE)
+    seen.margins(y=0.1)
     if len(repeated := repeated_frames(tracks_of(recording))):
         seen.plot(time_s[repeated], np.zeros(len(repeated)), "|", color=_RED, markersize=12)
     marked = f"; {len(repeated)} repeat (marked)" if len(repeated) else ""
@@ -123,6 +124,7 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     if has_odometry or truth is not None:
         path.legend(loc="best", fontsize=8)
     else:
+        path.set_axis_off()
         path.text(0.5, 0.5, "neither odometry nor truth", transform=path.transAxes, ha="center", color=_GREY)
     return figure
 
@@ -137,6 +139,11 @@ def _content(content: Recording | RecordingFile) -> RecordingFile:
 def _num(value: float) -> str:
     """A number with as many digits as a person wants."""
     return f"{float(value):.4g}"
+
+
+def _shown(path: str) -> str:
+    """A name from the file, with what a terminal would obey or cannot print written out."""
+    return path if path.isprintable() else repr(path)
 
 
 def _odometry(recording: Recording) -> str:

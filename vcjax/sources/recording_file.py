@@ -9,7 +9,7 @@ columns, F of features in the world, L of labelled tracks:
 |---|---|---|
 | `schema` | () | version of this layout, 1 |
 | `time_s`, `odometry`, … `start_cov` | | the fields of `Recording`, under their names |
-| `camera_intrinsics_px`, `camera_image_size_px`, `camera_distortion` | (4,), (2,), (K,) | its camera |
+| `camera_intrinsics_px`, `camera_image_size_px`, `camera_distortion` | (4,), (2,), (K,) | its camera; K is at most 8 |
 | `truth_robot`, `truth_sensor` | (T, 7) | optional: true poses; NaN where nobody knows |
 | `truth_landmarks_m`, `truth_is_moving` | (T, F, 3), (F,) | with them: the features of the world; F may be 0 |
 | `label_track_id`, `label` | (L,) | optional: tracks and what each follows, a number of `TrackLabel` |
@@ -36,6 +36,9 @@ from vcjax.sources.calibration import MAX_SIDE_PX, Calibration
 
 SCHEMA = 1
 """Version of the layout, raised when an older reader would misread it."""
+
+MAX_DISTORTION = 8
+"""Most coefficients of a recording's camera; no lens model here has more."""
 
 _KINDS = {"track_id": "iu", "is_valid": "b", "is_last": "b"}
 _RECORDING = {f.name: _KINDS.get(f.name, "f") for f in dataclasses.fields(Recording) if f.name != "camera"}
@@ -179,6 +182,8 @@ def _check(path: str, content: RecordingFile) -> None:
         raise ValueError(
             f"{path}: Camera(image_size_px={size.tolist()}): give a width and height of 1 to {MAX_SIDE_PX} px."
         )
+    if (num := np.size(recording.camera.distortion)) > MAX_DISTORTION:
+        raise ValueError(f"{path}: Camera(distortion) has {num} coefficients; give at most {MAX_DISTORTION}.")
     if truth is not None:
         num_features = np.shape(truth.is_moving)[0] if np.ndim(truth.is_moving) == 1 else "F"
         shapes = {
