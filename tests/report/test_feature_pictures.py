@@ -134,10 +134,15 @@ def test_path_from_above_shows_what_there_is():
     truth = path.copy()
     truth[2:] = np.nan
     axes = path_figure(path, landmarks, odometry=path, truth=truth).axes[0]
-    assert axes.get_title() == "Path and landmarks from above; 1 landmarks lie farther away"
+    assert axes.get_title() == "Path and landmarks from above\nfarther away: 1 unused"
     names = set(axes.get_legend_handles_labels()[1])
-    assert names == {"accepted (1)", "dynamic (1)", "odometry alone", "truth", "filter"}
+    lines = {"odometry alone", "truth", "filter", "start"}
+    assert names == {"accepted (1)", "dynamic (1)", "unused (1)"} | lines
     assert axes.get_xlim()[0] < 0 and 4 < axes.get_xlim()[1] < 10 and axes.get_ylim()[0] < -2
     assert len(axes.patches) == 2
+    far = landmarks._replace(place_m=places[[0, 2, 2]], cov=cov[[0, 2, 2]])
+    axes = path_figure(path, far).axes[0]
+    assert axes.get_title().endswith("farther away: 1 dynamic, 1 unused")
+    assert "dynamic (1)" in axes.get_legend_handles_labels()[1]
     nothing = LandmarkMap(np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)), ())
     assert path_figure(path, nothing).axes[0].get_title() == "Path and landmarks from above"

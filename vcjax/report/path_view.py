@@ -29,7 +29,8 @@ def path_figure(
 ) -> Figure:
     """Path (x, y) of the robot, and landmarks in the colours of their classes with 2 σ ellipses.
 
-    The view holds the paths and most of the landmarks that are known well; those outside are counted in the title.
+    The view holds the paths and most of the landmarks that are known well; those outside are counted in the title, by
+    class. The legend counts all.
 
     Args:
         path: estimated poses.
@@ -48,17 +49,17 @@ def path_figure(
         colour = tuple(part / 255 for part in colour)
         _ellipses(axes, landmarks, chosen, colour, float(np.max(high - low)))
         size = 16 if kind == "dynamic" else 6
-        if np.any(chosen):
-            axes.scatter(*xy[chosen].T, s=size, color=[colour], label=f"{kind} ({np.sum(kinds == kind)})", zorder=3)
+        if num := int(np.sum(kinds == kind)):
+            axes.scatter(*xy[chosen].T, s=size, color=[colour], label=f"{kind} ({num})", zorder=3)
     if odometry is not None:
         axes.plot(*odometry[:, :2].T, color=_ODOMETRY, linewidth=1.2, label="odometry alone", zorder=4)
     if truth is not None:
         axes.plot(*truth[:, :2].T, color=_TRUTH, linewidth=1.2, linestyle=(0, (4, 2)), label="truth", zorder=6)
     axes.plot(*path[:, :2].T, color=_PATH, linewidth=1.8, label="filter", zorder=5)
-    axes.plot(*path[0, :2], "s", color=_PATH, markersize=6, zorder=7)
+    axes.plot(*path[0, :2], "s", color=_PATH, markersize=6, label="start", zorder=7)
     axes.set(xlabel="x (m)", ylabel="y (m)", xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    far = int(np.sum(~is_inside))
-    axes.set_title("Path and landmarks from above" + (f"; {far} landmarks lie farther away" if far else ""))
+    far = [f"{num} {kind}" for kind in CLASS_COLOURS if (num := int(np.sum(~is_inside & (kinds == kind))))]
+    axes.set_title("Path and landmarks from above" + (f"\nfarther away: {', '.join(far)}" if far else ""))
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
