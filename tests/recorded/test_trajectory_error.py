@@ -117,6 +117,15 @@ def test_truth_of_every_other_frame_is_no_gap():
     found = trajectory_error(moved(true, Rotation.identity(), 0.0, 1.02), Trajectory(true.poses[::2], true.time_s[::2]))
     step = np.linalg.norm(np.diff(true.poses[::2, :3], axis=0), axis=1)
     assert found.num_poses == 200 and found.step_rmse_m == pytest.approx(0.02 * np.sqrt(np.mean(step**2)))
+    assert "\nRPE, steps of 0.2 s " in trajectory_error_text(found)
+
+
+def test_steps_are_as_long_as_the_truth_is_sparse():
+    true, sparse = path(), path().poses.copy()
+    sparse[np.arange(400) % 10 != 0] = np.nan
+    for times, step in ((true.time_s, "1 s"), (None, "10 poses")):
+        found = trajectory_error(Trajectory(true.poses, times), Trajectory(sparse, times))
+        assert f"\nRPE, steps of {step} " in trajectory_error_text(found)
 
 
 def test_what_cannot_be_compared_is_refused():
@@ -142,7 +151,7 @@ def test_every_line_says_what_is_aligned():
     lines = trajectory_error_text(trajectory_error(disturbed(path(), 0.1), path())).splitlines()
     assert [line[:26].strip() for line in lines] == [
         "compared", "APE, not aligned", "APE, first pose aligned", "APE, aligned, rigid", "APE, aligned, with scale",
-        "RPE, each step", "drift per 100 m",
+        "RPE, steps of 0.1 s", "drift per 100 m",
     ]  # fmt: skip
     assert "scale" in lines[4] and all(line.endswith("not aligned") for line in lines[5:])
 
@@ -152,3 +161,10 @@ def test_a_robot_that_stands_has_no_drift():
     found = trajectory_error(Trajectory(poses), Trajectory(poses))
     assert math.isnan(found.drift_m_per_100_m) and found.absolute["none"].rmse_m == 0.0
     assert trajectory_error_text(found).splitlines()[-1].endswith("not determined: the path is too short")
+
+
+def test_drift_of_a_short_path_is_noise_and_not_told():
+    poses = path(20).poses
+    short = Trajectory(poses * np.array([0.005, 0.005, 0.005, 1, 1, 1, 1]))
+    text = trajectory_error_text(trajectory_error(disturbed(short, 1e-3), short))
+    assert text.splitlines()[-1].endswith("not determined: the path is too short")

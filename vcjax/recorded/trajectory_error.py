@@ -25,6 +25,8 @@ Alignment = Literal["none", "first pose", "rigid", "similarity"]
 ALIGNMENTS: tuple[Alignment, ...] = ("none", "first pose", "rigid", "similarity")
 DRIFT_M = 100.0
 """Length of the stretches over which drift is measured, m, where the path is long enough."""
+LEAST_STRETCH_M = 5.0
+"""Shortest stretches of which drift is told, m: per 100 m those below show the noise of two poses, many times over."""
 _NO_RIGID = "not determined: the places lie on a line"
 _NO_DRIFT = "not determined: the path is too short"
 MAX_TIME_DIFFERENCE_S = 0.01
@@ -60,8 +62,11 @@ class TrajectoryError(NamedTuple):
     """Length of the true path, without gaps, m."""
     absolute: dict[Alignment, AbsoluteError]
     """NaN where an alignment is not determined."""
+    step: float
+    """Median step from each compared pose to the next: s, or where poses have no times, their numbers."""
+    step_unit: Literal["s", "poses"]
     step_rmse_m: float
-    """RMS of the RPE from each pose to the next, m."""
+    """RMS of the RPE from each compared pose to the next, m."""
     step_rmse_deg: float
     """The same of the angle, deg."""
     drift_m_per_100_m: float
@@ -101,6 +106,8 @@ def trajectory_error(estimate: Trajectory, truth: Trajectory) -> TrajectoryError
         num_poses=true.num_poses,
         path_m=length,
         absolute=absolute,
+        step=float(np.median(np.diff(true.timestamps))),
+        step_unit="poses" if estimate.time_s is None or truth.time_s is None else "s",
         step_rmse_m=_rms(step[0]),
         step_rmse_deg=_rms(step[1]),
         drift_m_per_100_m=drift[0],
@@ -127,12 +134,14 @@ def trajectory_error_text(found: TrajectoryError) -> str:
                 _NO_RIGID if math.isnan(error.rmse_m) else text + scale,
             )
         )
-    rows.append(("RPE, each step", f"{found.step_rmse_m:.4g} m, {found.step_rmse_deg:.4g}° RMS; not aligned"))
+    step = f"steps of {found.step:.3g} {found.step_unit}"
+    rows.append((f"RPE, {step}", f"{found.step_rmse_m:.4g} m, {found.step_rmse_deg:.4g}° RMS; not aligned"))
     drift = (
         f"{found.drift_m_per_100_m:.4g} m, {found.drift_deg_per_100_m:.4g}° on average, from stretches of "
         f"{found.stretch_m:.4g} m; not aligned"
     )
-    rows.append(("drift per 100 m", _NO_DRIFT if math.isnan(found.drift_m_per_100_m) else drift))
+    is_short = math.isnan(found.drift_m_per_100_m) or found.stretch_m < LEAST_STRETCH_M
+    rows.append(("drift per 100 m", _NO_DRIFT if is_short else drift))
     return "\n".join(f"{name:26s} {text}" for name, text in rows)
 
 
