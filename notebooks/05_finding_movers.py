@@ -51,7 +51,7 @@ from vcjax.study.detect import detect
 from vcjax.study.detection_methods import METHODS
 
 SPEED_M_S, A_M = 0.5, 0.1
-THRESHOLD = 20.0
+THRESHOLD = 24.0
 FILTER = METHODS["RE+velocity_glr"].config
 assert isinstance(FILTER.detector, vc.VelocityGLR) and FILTER.detector.threshold == THRESHOLD
 steady, swinging = (
