@@ -35,7 +35,7 @@ class Study:
     """Which numbers."""
     points: int = 20
     """Values along each axis of the grid."""
-    grid_seeds: int = 5
+    grid_seeds: int = 10
     """Runs of each scene at every point of the grid."""
     starts: int = 3
     """Descents."""
@@ -43,11 +43,11 @@ class Study:
     """Steps of each."""
     learning_rate: float = 0.4
     """How far the first of them goes; the fewer steps, the farther they have to go."""
-    pairs: int = 3
+    pairs: int = 4
     """Pairs of runs of each scene in a step."""
-    choosing_seeds: int = 12
+    choosing_seeds: int = 50
     """Runs of each scene by which the best descent is chosen."""
-    held_out_seeds: int = 200
+    held_out_seeds: int = 400
     """Runs of each scene on which the two are compared."""
     key: int = 0
     """Number of the random keys, of which each of the three parts has its own."""

@@ -45,7 +45,7 @@ class Study:
     """Steps of each."""
     pairs: int = 6
     """Pairs of runs of each scene in a step."""
-    choosing_seeds: int = 16
+    choosing_seeds: int = 48
     """Runs of each scene that choose among the ends of the descents."""
     held_out_seeds: int = 100
     """Runs of each scene that compare the choice with before."""

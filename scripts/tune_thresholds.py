@@ -38,7 +38,7 @@ class Study:
     """Steps of each."""
     pairs: int = 3
     """Pairs of runs of each scene in a step."""
-    choosing_seeds: int = 8
+    choosing_seeds: int = 48
     """Runs of each scene that choose among the ends of the descents."""
     held_out_seeds: int = 100
     """Runs of each scene that compare the choice with before."""

@@ -232,7 +232,7 @@ def test_curves_are_of_runs_at_each_threshold_in_the_scenes_with_movers(tmp_path
     name, thresholds = "RE+velocity_glr", METHODS["RE+velocity_glr"].curve
     runs, curves = detect(tmp_path, [name], curves=True, **options)
     assert len(runs) == 6 and list(curves) == [(name, 0.1)] and tuple(curves[name, 0.1]) == thresholds
-    assert sorted(worked[6:]) == sorted((v, th) for v in (1.0, 0.5) for th in thresholds if th != 20.0)
+    assert sorted(worked[6:]) == sorted((v, th) for v in (1.0, 0.5) for th in thresholds if th != 24.0)
     two_scenes = [2 * each for each in counts(runs[name, Scene(0.1, "lateral", 1.0)])]
     for point in curves[name, 0.1].values():
         np.testing.assert_array_equal(point, two_scenes)

@@ -53,7 +53,7 @@ class Tune:
     """"soft" has a true gradient, "straight_through" the hard filter's numbers."""
     starts: int = 3
     """Descents: from the setting before, and from points spread over what is allowed."""
-    choosing_seeds: int = 16
+    choosing_seeds: int = 48
     """Runs of each scene by which the best end of a descent is chosen."""
     held_out_seeds: int = 100
     """Runs of each scene on which it is compared with the setting before."""

@@ -50,7 +50,7 @@ def _with(gate: AbstractGate, detector: AbstractDetector) -> FilterConfig:
 _TH1, _BOTH = ("config.gate.th1",), ("config.gate.th1", "config.gate.th2")
 _GATE_CURVE = (3.0, 6.0, 9.0, 14.0, 22.0, 36.0)
 # χ²₃ is above 7.8 in one of twenty tests of a static landmark: cheap to leave out, and a mover does little harm below.
-_GLR, _GLR_CURVE = VelocityGLR(threshold=20.0, suspect=7.8), (8.0, 11.0, 15.0, 20.0, 28.0, 40.0)
+_GLR, _GLR_CURVE = VelocityGLR(threshold=24.0, suspect=7.8), (8.0, 11.0, 16.0, 24.0, 34.0, 50.0)
 _GLR_LEAVES = ("config.detector.threshold",)
 # A gate that leaves out less keeps tests of the innovations as they come closer to their χ² (see `left_out`).
 _WIDE = ReprojectionError(th1=12.0)

@@ -60,8 +60,8 @@ class Choice(NamedTuple):
 class Seeds(eqx.Module):
     """How many runs of each scene there are, for each setting."""
 
-    choosing: int = eqx.field(static=True, default=16)
-    """To choose among the candidates."""
+    choosing: int = eqx.field(static=True, default=48)
+    """To choose among the candidates: cheap beside the descents, and with few of them luck chooses."""
     held_out: int = eqx.field(static=True, default=100)
     """To compare the choice with what was there before."""
 
@@ -97,7 +97,7 @@ def choose(
         ValueError: as `evaluate`, or if every candidate has a run that is not finite.
     """
     require_key("choose", key)
-    require_kind("choose", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=16, held_out=100).")
+    require_kind("choose", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=48, held_out=100).")
     (_, choosing_key), (_, held_out_key) = _kinds(seeds, key)
     if directory is not None:
         check_directory(directory, scenarios, config, len(candidates), objective=objective, seeds=seeds, key=key)

@@ -100,7 +100,7 @@ def tune(
     require_key("tune", key)
     schedule, seeds = Schedule() if schedule is None else schedule, Seeds() if seeds is None else seeds
     require_kind("tune", "schedule", schedule, Schedule, "give a Schedule, e.g. Schedule(num_steps=20).")
-    require_kind("tune", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=16, held_out=100).")
+    require_kind("tune", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=48, held_out=100).")
     require_whole("tune", "num_starts", num_starts, 1)
     directory = as_directory("tune", directory)
     problem = problem_of(scenarios, config, parameters, objective)
