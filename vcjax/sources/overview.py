@@ -90,11 +90,11 @@ def draw_overview(content: Recording | RecordingFile) -> Any:
     (seen, lengths), (image, path) = figure.subplots(2, 2)
 
     seen.plot(time_s, np.sum(np.asarray(recording.is_valid), axis=1), color=_BLUE)
-    seen.margins(y=0.1)
     if len(repeated := repeated_frames(tracks_of(recording))):
         seen.plot(time_s[repeated], np.zeros(len(repeated)), "|", color=_RED, markersize=12)
     marked = f"; {len(repeated)} repeat (marked)" if len(repeated) else ""
-    seen.set(xlabel="time (s)", ylabel="features seen", title=f"Features in each frame{marked}", ylim=(0, None))
+    seen.set(xlabel="time (s)", ylabel="features seen", title=f"Features in each frame{marked}")
+    seen.set_ylim(0, 1.1 * max(1, int(np.sum(np.asarray(recording.is_valid), axis=1).max())))
     if len(length):
         begin = np.unique(np.rint(np.geomspace(1, length.max() + 1, 30)))  # the first whole number in each bar
         lengths.hist(length, np.sqrt(begin * (begin - 1 + (begin == 1) / 2)), color=_BLUE)
