@@ -35,6 +35,16 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     assert all(step["parameters"]["scenario.oscillation.amplitude_m"] < 0.1 for step in content["history"][1])
     assert len(content["before"]["parameters"]) == 4
     assert content["steps_skipped"] == content["pairs_failed"] == 0 and content["starts_left_out"] == []
+    wanted, origin, candidates = content["wanted"], content["origin"], content["candidates"]
+    assert (wanted["track_f1"], wanted["position"], wanted["camera_motion"]) == (1.0, 2.0, 0.02)
+    assert origin["seeds"] == {"class": "Seeds", "choosing": 2, "held_out": 3} and origin["key"] == "[0, 0]"
+    assert origin["config"]["smoothing"] == "soft" and origin["schedule"]["num_steps"] == 2
+    assert list(origin["scenarios"]) == ["lateral, 1 m/s", "lateral, 0.5 m/s"]
+    assert origin["scenarios"]["lateral, 0.5 m/s"]["movers"]["speed_m_s"] == 0.5
+    assert origin["parameters"]["scenario.oscillation.amplitude_m"]["high"] == 0.1
+    assert candidates[0]["parameters"] == content["before"]["parameters"] and len(candidates) == 3
+    assert content["after"]["parameters"] == min(candidates, key=lambda c: c["loss"]["mean"])["parameters"]
+    assert "Wanted, by weight: `track_f1` 1, `position` 2, `camera_motion` 0.02." in printed
     assert "All 4 steps were taken, each with all of its runs." in printed
     assert "| lateral, 0.5 m/s |" in printed and printed.strip() in (folder / "tune.md").read_text()
     for name in ("descent", "curves", "roc_by_scene", "landscape_thresholds", "landscape_oscillation"):
@@ -70,6 +80,9 @@ def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
     assert content["grid"][path] == pytest.approx([0.5, 2.0])
     np.testing.assert_allclose(content["grid"]["config.gate.th2"], np.geomspace(0.5, 64, 3))
     assert np.shape(content["grid"]["loss"]) == (2, 3)
+    assert content["wanted"]["position"] == 2.0 and content["origin"]["seeds"]["choosing"] == 2
+    assert content["origin"]["config"]["smoothing"] == "hard" and content["origin"]["key"] == "[0, 0]"
+    assert list(content["origin"]["scenarios"]) == ["lateral, 1 m/s", "lateral, 0.5 m/s"]
     assert f"`{path}`" in printed and f"wrote {tmp_path / 'figures' / 'landscape'}.png" in told
     with xr.open_dataset(tmp_path / "sweep.nc") as runs:
         assert dict(runs.loss.sizes) == {path: 2, "config.gate.th2": 3, "scene": 2, "seed": 2}

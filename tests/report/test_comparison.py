@@ -12,9 +12,11 @@ from vcjax.report.descent import descent_figure
 from vcjax.report.detection_curves import curves_figure, roc_by_scene_figure
 from vcjax.report.landscape import PANELS, landscape_figure
 from vcjax.report.tuning import write_search, write_tuning
-from vcjax.tuning.choice import ALL, COMPARED, RECALL, Choice
+from vcjax.study.results import describe
+from vcjax.tuning.choice import ALL, COMPARED, RECALL, Choice, Seeds
 from vcjax.tuning.descent import Step
 from vcjax.tuning.landscape import as_grid
+from vcjax.tuning.losses import Objective
 from vcjax.tuning.tune import Tuned
 
 TH1, TH2 = "config.gate.th1", "config.gate.th2"
@@ -55,7 +57,8 @@ def invented(settings: list[tuple[float, float]], num_seeds: int) -> xr.Dataset:
 def choice() -> Choice:
     points = [(9.0, 9.0), *((a, b) for a in (4.0, 8.0, 16.0) for b in (3.0, 9.0, 27.0))]
     before, after = ({TH1: th1, TH2: th2} for th1, th2 in (points[0], points[-1]))
-    return Choice(before, after, invented(points, 3), invented([points[0], points[-1]], 30))
+    origin = {"vcjax": "0", "objective": describe(Objective(position=2.0)), "seeds": describe(Seeds(3, 30))}
+    return Choice(before, after, invented(points, 3), invented([points[0], points[-1]], 30), origin)
 
 
 def test_means_and_paired_intervals_are_those_of_scipy(choice):
@@ -106,6 +109,36 @@ def test_seeds_that_failed_are_told_and_flatter_nobody(choice):
     assert "went non-finite" not in comparison_markdown(comparison(choice))
 
 
+@pytest.mark.parametrize(("failed_before", "failed_after"), [(0, 0), (0, 12), (3, 12)])
+def test_equal_settings_do_not_differ_whatever_failed(choice, failed_before, failed_after):
+    """Only what both sides have is compared, recall too, and in the same resamples."""
+    held_out = choice.held_out.isel(setting=[0, 0]).copy(deep=True)
+    for place in ((0, 0, slice(20, 20 + failed_before)), (1, 0, slice(failed_after))):
+        held_out.is_finite[place] = False
+        for name in (*COMPARED, "track_score"):
+            held_out[name][place] = np.nan
+    compared = comparison(choice._replace(held_out=held_out))
+    num = 30 - failed_before - failed_after
+    for scene, num_pairs in zip((*SCENES, ALL), (num, 30, num), strict=True):
+        for name in ("loss", RECALL):
+            expected = {"mean": 0.0, "lower": 0.0, "upper": 0.0, "num_pairs": num_pairs}
+            assert compared["paired"][scene][name] == expected
+        assert compared["before"]["metrics"][scene][RECALL]["se"] > 0.01
+
+
+def test_recall_has_no_pairs_where_there_is_none(choice):
+    """No mover among the tracks; and no seed that stayed finite on both sides."""
+    static = choice.held_out.assign(track_score=choice.held_out.track_score.where(~choice.held_out.is_moving))
+    failed = choice.held_out.copy(deep=True)
+    failed.is_finite[0, :, :15] = failed.is_finite[1, :, 15:] = False
+    failed["track_score"] = failed.track_score.where(failed.is_finite)
+    for held_out in (static, failed):
+        paired = comparison(choice._replace(held_out=held_out))["paired"]
+        for scene in (*SCENES, ALL):
+            assert paired[scene][RECALL]["num_pairs"] == 0
+            assert all(np.isnan(paired[scene][RECALL][part]) for part in ("mean", "lower", "upper"))
+
+
 def test_figures_of_one_scene_have_their_titles_whole(choice):
     one = choice._replace(held_out=choice.held_out.isel(scene=[0]))
     for figure in (roc_by_scene_figure(one), roc_by_scene_figure(choice), curves_figure(one)):
@@ -134,18 +167,26 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     assert all(path.is_file() and path.stat().st_size > 0 for path in paths)
     content = json.loads((tmp_path / "sweep" / "sweep.json").read_text())
     assert content["grid_dimensions"] == [TH1, TH2] and np.shape(content["grid"]["detection_f1"]) == (3, 3)
-    np.testing.assert_allclose(content["grid"]["loss"], as_grid(choice).loss.mean(("scene", "seed")))
+    grid = as_grid(choice)
+    np.testing.assert_allclose(content["grid"]["loss"], grid.loss.mean(("scene", "seed")))
     figures = {path.name for path in paths if path.suffix == ".png"}
     assert figures == {
         "landscape.png", "landscape_scene_1.png", "landscape_scene_2.png", "curves.png", "roc_by_scene.png"
     }  # fmt: skip
 
-    assert "all of these stayed finite" in (tmp_path / "sweep" / "sweep.md").read_text()
+    text = (tmp_path / "sweep" / "sweep.md").read_text()
+    assert "all of these stayed finite" in text and "Wanted, by weight: `track_f1` 1, `position` 2.\n" in text
+    assert content["wanted"] == describe(Objective(position=2.0)) and "candidates" not in content
+    assert content["origin"] == {"vcjax": "0", "seeds": describe(Seeds(3, 30))}
     steps = [Step({TH1: 9.0 + k, TH2: 9.0 - k}, 1.0, 0.5, np.nan, {TH1: 0.1, TH2: 0.2}, {}, {}, k) for k in range(3)]
     steps.append(Step({TH1: 12.0, TH2: 6.0}, 1.0, np.nan, np.nan, {TH1: np.nan, TH2: np.nan}, {}, {}, 4))
     left_out = [{TH1: 50.0, TH2: 1.0}]
-    tuned = Tuned([steps, steps], choice, 64, left_out)
-    paths = write_tuning(tuned, {"thresholds": as_grid(choice)}, tmp_path / "tune")
+    points = choice.candidates.isel(setting=[0, 4, 9]).copy(deep=True)
+    points.loss[1, 0, 2] = np.nan
+    choice = choice._replace(candidates=points)
+    origin = {"vcjax": "1", "parameters": {TH1: "between"}}
+    tuned = Tuned([steps, steps], choice, 64, origin, left_out)
+    paths = write_tuning(tuned, {"thresholds": grid}, tmp_path / "tune")
     told = "1 of 3 starts were left out, 2 of 8 steps were not taken, 14 of 32 pairs of runs were left out of steps"
     assert told in (tmp_path / "tune" / "tune.md").read_text()
     content = json.loads((tmp_path / "tune" / "tune.json").read_text())
@@ -153,6 +194,18 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     assert content["history"][1][2]["parameters"] == {TH1: 11.0, TH2: 7.0}
     assert content["history"][0][3]["loss"] is None and (content["steps_skipped"], content["pairs_failed"]) == (2, 14)
     assert content["starts_left_out"] == left_out
+    assert content["wanted"] == describe(Objective(position=2.0))
+    assert content["origin"] == {"vcjax": "1", "seeds": describe(Seeds(3, 30)), "parameters": {TH1: "between"}}
+    before, failed, after = content["candidates"]
+    assert before["parameters"] == choice.before and after["parameters"] == choice.after
+    assert failed == {"parameters": {TH1: 8.0, TH2: 3.0}, "loss": {"mean": None, "se": None}}
+    losses = points.loss[2].mean("scene")
+    assert after["loss"] == {"mean": pytest.approx(float(losses.mean())), "se": pytest.approx(stats.sem(losses))}
+    text = (tmp_path / "tune" / "tune.md").read_text()
+    assert "Wanted, by weight: `track_f1` 1, `position` 2.\n" in text
+    assert "| end of descent 1 | 8 | 3 | – |" in text
+    chosen = f"| **end of descent 2** | 16 | 27 | {after['loss']['mean']:.4f} ± {after['loss']['se']:.4f} |"
+    assert chosen in text and "| before | 9 | 9 | " in text and "3 seeds of each scene" in text
     assert {"before", "after", "history", "paired"} <= set(content)
     figures = {path.name for path in paths if path.suffix == ".png"}
     assert figures == {"descent.png", "landscape_thresholds.png", "curves.png", "roc_by_scene.png"}

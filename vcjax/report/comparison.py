@@ -1,7 +1,7 @@
 """What a choice of settings is worth: every figure before and after, and the differences paired by seed."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,26 +48,23 @@ def comparison(choice: Choice) -> dict[str, Any]:
     `before` and `after` hold `parameters`, the `loss` (mean and se over all scenes), `seeds_failed` (how many have a
     run that failed in some scene, and so are in no mean over all scenes) and by scene, the last of which is all of
     them, `metrics`: each figure with `mean` and `se`. `paired` holds by scene and figure the `mean` of after -
-    before, its 95 % interval `lower` to `upper`, and `num_pairs`. Recall at 1 % static has its se and interval by
-    bootstrap; the others are Student-t.
+    before, its 95 % interval `lower` to `upper`, and `num_pairs`: how many seeds count, which are those that
+    stayed finite and have the figure on both sides. Recall at 1 % static has its se and interval by bootstrap; the
+    others are Student-t.
     """
     runs = [choice.held_out.isel(setting=i, drop=True) for i in (0, 1)]
     scenes, tracks = [by_scene(each) for each in runs], [tracks_of(each) for each in runs]
+    in_both = choice.held_out.is_finite.all("setting")
     metrics: list[dict[str, Any]] = [{}, {}]
     paired: dict[str, Any] = {}
     for name in scenes[0]:
         found = [_mean(scene[name]) for scene in scenes]
         paired[name] = _difference(scenes[0][name], scenes[1][name])
-        recall = [_recall(track[name]) for track in tracks]
-        for figures, (value, samples) in zip(found, recall, strict=True):
+        for figures, track in zip(found, tracks, strict=True):
+            value, samples = _recall(track[name])
             figures[RECALL] = {"mean": value, "se": float(np.std(samples))}
-        lower, upper = roc.interval(recall[1][1] - recall[0][1])
-        paired[name][RECALL] = {
-            "mean": recall[1][0] - recall[0][0],
-            "lower": float(lower),
-            "upper": float(upper),
-            "num_pairs": int(choice.held_out.sizes["seed"]),
-        }
+        is_pair = in_both.all("scene") if name == ALL else in_both.sel(scene=name)
+        paired[name][RECALL] = _recall_difference([track[name] for track in tracks], is_pair.values)
         for part, figures in zip(metrics, found, strict=True):
             part[name] = figures
     last = list(paired)[-1]
@@ -152,6 +149,17 @@ def _recall(tracks: roc.Tracks) -> tuple[float, np.ndarray]:
     """Recall at `FALSE_RATE`, and the same of every resample of the seeds."""
     rate = np.array([FALSE_RATE])
     return float(roc.recall_at(tracks, rate)[0, 0]), roc.resampled(roc.recall_at, tracks, rate)[:, 0]
+
+
+def _recall_difference(tracks: Sequence[roc.Tracks], is_pair: np.ndarray) -> dict[str, Any]:
+    """After - before of the seeds that stayed finite in both, with its interval by the same resamples of them."""
+    mean = lower = upper = math.nan
+    if np.any(is_pair):
+        before, after = (_recall(roc.Tracks(each.score[is_pair], each.is_mover[is_pair])) for each in tracks)
+        mean = after[0] - before[0]
+        lower, upper = map(float, roc.interval(after[1] - before[1]))
+    num = int(np.sum(is_pair)) if _is_finite(mean) else 0
+    return {"mean": mean, "lower": lower, "upper": upper, "num_pairs": num}
 
 
 def _is_finite(value: float | None) -> bool:

@@ -1,5 +1,6 @@
 """What a search for settings gave, as files: JSON for programs, Markdown for people, figures."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,14 @@ from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.descent import descent_figure
 from vcjax.report.detection_curves import curves_figure, roc_by_scene_figure
 from vcjax.report.landscape import landscape_figure
+from vcjax.report.markup import grid as table
 from vcjax.report.style import write_figure
 from vcjax.storage import check_writable, write_file, write_json
 from vcjax.study.results import save
+from vcjax.study.summary import mean_and_error
 from vcjax.tuning.choice import Choice
 from vcjax.tuning.landscape import as_grid, means
+from vcjax.tuning.losses import SHAPES
 from vcjax.tuning.tune import Tuned
 
 
@@ -22,7 +26,9 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     """Write `tune.json`, `tune.md` and the figures of a tuning into a directory.
 
     `tune.json` is a `comparison` with the `history` of every descent, each step with its parameters, temperature,
-    smoothed loss and gradient; and how many runs there were, and starts, steps and pairs of runs that were left out.
+    smoothed loss and gradient; how many runs there were, and starts, steps and pairs of runs that were left out; what
+    was `wanted`, the weights of the objective; the `origin` of it all; and the `candidates`, setting before and ends of
+    the descents, each with its mean `loss` on the seeds that chose.
 
     Args:
         tuned: the tuning.
@@ -34,15 +40,16 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     Raises:
         OSError: if the directory cannot be written to.
     """
-    compared = comparison(tuned.choice)
+    compared = comparison(tuned.choice) | _wanted({**tuned.choice.origin, **tuned.origin})
     compared["runs"]["descents"] = tuned.num_runs
     compared |= {
         "history": [[step._asdict() for step in steps] for steps in tuned.descents],
         "steps_skipped": tuned.num_skipped,
         "pairs_failed": tuned.num_failed,
         "starts_left_out": [dict(start) for start in tuned.left_out],
+        "candidates": _candidates(tuned.choice),
     }
-    title = "# Tuned by gradient\n\n" + _runs(compared) + " " + _left_out(tuned) + "\n"
+    title = f"# Tuned by gradient\n\n{_runs(compared)} {_left_out(tuned)}\n{_weights(compared)}\n{_costs(compared)}"
     paths = _write(compared, title, directory / "tune")
     folder = directory / "figures"
     paths += write_figure(descent_figure(tuned.descents), folder / "descent")
@@ -59,19 +66,19 @@ def write_search(choice: Choice, directory: Path) -> list[Path]:
     """Write `sweep.nc` (all runs of the grid), `sweep.json`, `sweep.md` and the figures of a search into a directory.
 
     `sweep.json` is a `comparison`, `after` being the best point of the grid, with the means over all scenes and seeds
-    of every point: `grid`.
+    of every point: `grid`; what was `wanted`, the weights of the objective; and the `origin` of it all.
 
     Returns: the paths written.
 
     Raises:
         OSError: if the directory cannot be written to.
     """
-    compared, grid = comparison(choice), as_grid(choice)
+    compared, grid = comparison(choice) | _wanted(choice.origin), as_grid(choice)
     points = means(grid)[["loss", "detection_f1", "detection_auc", "detection_delay_frames", "position_rmse_cm"]]
     compared["grid"] = {str(name): values.values.tolist() for name, values in {**points.coords, **points}.items()}
     compared["grid_dimensions"] = [str(dim) for dim in points.loss.dims]
     paths = [save(grid, directory / "sweep.nc")]
-    title = f"# Best point of a grid of {points.loss.size}\n\n" + _runs(compared) + "\n"
+    title = f"# Best point of a grid of {points.loss.size}\n\n{_runs(compared)}\n{_weights(compared)}"
     paths += _write(compared, title, directory / "sweep")
     folder, marks = directory / "figures", {"before": choice.before, "best point": choice.after}
     paths += write_figure(landscape_figure(grid, f"Hard decisions, {_means(grid)}", marks), folder / "landscape")
@@ -118,6 +125,46 @@ def _runs(compared: Mapping[str, Any]) -> str:
     parts += [f"{runs['choosing']} runs to choose", f"{runs['held_out']} held out"]
     failed = f"{runs['failed']} of these went non-finite" if runs["failed"] else "all of these stayed finite"
     return f"{', '.join(parts)}; {failed}."
+
+
+def _wanted(origin: Mapping[str, Any]) -> dict[str, Any]:
+    """The objective, and what else a search comes from."""
+    rest = {name: value for name, value in origin.items() if name != "objective"}
+    return {"wanted": origin["objective"], "origin": rest}
+
+
+def _weights(compared: Mapping[str, Any]) -> str:
+    weights = {name: value for name, value in compared["wanted"].items() if name not in ("class", *SHAPES) and value}
+    return f"Wanted, by weight: {', '.join(f'`{name}` {value:g}' for name, value in weights.items())}.\n"
+
+
+def _candidates(choice: Choice) -> list[dict[str, Any]]:
+    """Each with the mean over scenes and seeds that chose, NaN where a run failed, and its standard error."""
+    loss = choice.candidates.loss.mean("scene", skipna=False)
+    mean, error = mean_and_error(loss, xr.ones_like(loss, bool))
+    parameters = {path: choice.candidates[path].values.tolist() for path in choice.before}
+    return [
+        {
+            "parameters": {path: values[i] for path, values in parameters.items()},
+            "loss": {"mean": float(mean[i]), "se": float(error[i])},
+        }
+        for i in range(loss.sizes["setting"])
+    ]
+
+
+def _costs(compared: Mapping[str, Any]) -> str:
+    """The candidates as a table; bold what was chosen."""
+    rows = []
+    for number, candidate in enumerate(compared["candidates"]):
+        (mean, error), values = candidate["loss"].values(), candidate["parameters"]
+        name = f"end of descent {number}" if number else "before"
+        name = f"**{name}**" if values == compared["after"]["parameters"] else name
+        spread = f" ± {error:.4f}" if math.isfinite(error) else ""
+        cost = f"{mean:.4f}{spread}" if math.isfinite(mean) else "–"
+        rows.append([name, *(f"{value:.4g}" for value in values.values()), cost])
+    seeds = compared["origin"]["seeds"]["choosing"]
+    header = ["candidate", *(f"`{path}`" for path in compared["before"]["parameters"]), "loss ± standard error"]
+    return f"Candidates on the {seeds} seeds of each scene that chose; bold the chosen one.\n\n{table(header, rows)}"
 
 
 def _left_out(tuned: Tuned) -> str:

@@ -17,8 +17,9 @@ from vcjax.fields import require_count, require_key, require_kind
 from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study import roc
+from vcjax.study.results import describe, provenance
 from vcjax.study.sweep import Experiment, number_at, require_paths
-from vcjax.tuning.blocks import check_blocks
+from vcjax.tuning.blocks import check_blocks, hard
 from vcjax.tuning.evaluate import evaluate, stacked
 from vcjax.tuning.losses import Objective
 
@@ -55,6 +56,8 @@ class Choice(NamedTuple):
     """Runs (setting, scene, seed) of all candidates, the first being `before`; see `evaluate`."""
     held_out: Any
     """Runs of `before` (setting 0) and `after` (setting 1) on other seeds."""
+    origin: Mapping[str, Any]
+    """What it comes from, as plain values: version, key, scenes, filter, objective, numbers of seeds."""
 
 
 class Seeds(eqx.Module):
@@ -124,7 +127,14 @@ def choose(
     if np.all(np.isnan(loss)):
         raise ValueError("every candidate has runs that did not stay finite; start elsewhere.")
     after = candidates[int(np.nanargmin(loss))]
-    return Choice(candidates[0], after, runs, judge("held out", [candidates[0], after], seeds.held_out, held_out_key))
+    held_out = judge("held out", [candidates[0], after], seeds.held_out, held_out_key)
+    origin = provenance(key) | {
+        "scenarios": {name: describe(scenario) for name, scenario in scenarios.items()},
+        "config": describe(hard(config)),
+        "objective": describe(objective),
+        "seeds": describe(seeds),
+    }
+    return Choice(candidates[0], after, runs, held_out, origin)
 
 
 def check_directory(

@@ -133,7 +133,7 @@ def camera_motion_m2_s2(scenario: Scenario) -> Float[Array, ""]:
     return 0.5 * (2.0 * jnp.pi * jnp.asarray(f) * A) ** 2
 
 
-_SHAPES = ("mover_weight", "ranking_temperature")
+SHAPES = ("mover_weight", "ranking_temperature")
 """Fields of an objective that are no weights of losses."""
 
 
@@ -165,10 +165,10 @@ class Objective(eqx.Module):
     """τ of the order in the `ranking_loss`, in log-odds; positive."""
 
     def __check_init__(self):
-        weights = [name for name in vars(self) if name not in _SHAPES]
+        weights = [name for name in vars(self) if name not in SHAPES]
         for name in weights:
             require(self, name, lambda w: np.isfinite(w) & (w >= 0), "a weight is finite and at least 0.")
-        for name in _SHAPES:
+        for name in SHAPES:
             require(self, name, lambda v: np.isfinite(v) & (v > 0), "give a positive number.")
         values = [getattr(self, name) for name in weights]
         if all(map(is_concrete, values)) and not np.all(np.sum(np.broadcast_arrays(*values), axis=0) > 0):

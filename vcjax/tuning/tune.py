@@ -41,6 +41,8 @@ class Tuned(NamedTuple):
     """Where they were, the best end of a descent, and what it is worth."""
     num_runs: int
     """Runs in the descents, each with its derivative."""
+    origin: Mapping[str, Any]
+    """What the descents come from, as plain values, like that of `choice`; with the intervals and the schedule."""
     left_out: Sequence[Setting] = ()
     """Starts without a descent, since the objective was not finite there."""
 
@@ -137,7 +139,7 @@ def tune(
     place = None if directory is None else _choice_of(directory, len(candidates))
     choice = choose(scenarios, config, candidates, directory=place, progress=progress, **given)
     runs_per_step = 2 * schedule.pairs_per_step * len(scenarios)
-    return Tuned(descents, choice, runs_per_step * (sum(map(len, descents)) + len(left_out)), left_out)
+    return Tuned(descents, choice, runs_per_step * (sum(map(len, descents)) + len(left_out)), origin, left_out)
 
 
 def _choice_of(directory: Path, num_candidates: int) -> Path:
