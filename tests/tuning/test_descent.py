@@ -10,7 +10,6 @@ import pytest
 import tiny_runs
 from hypothesis import given
 from hypothesis import strategies as st
-from quick import QUICK
 
 from vcjax.tuning import descent as module
 from vcjax.tuning.descent import Schedule, descend, end_of

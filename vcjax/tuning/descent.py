@@ -155,7 +155,7 @@ def descend(
 
 
 def end_of(problem: Problem, schedule: Schedule, history: Sequence[Step]) -> dict[str, float]:
-    """Where a descent has led: the mean of the free numbers after each step of its last quarter, the noise averaged out.
+    """Where a descent has led: the mean of the free numbers after each step of its last quarter, less noisy than one.
 
     References:
         Polyak, Juditsky 1992, "Acceleration of stochastic approximation by averaging".

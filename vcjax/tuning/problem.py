@@ -75,9 +75,9 @@ def problem_of(
         objective: what to make small; soft F1 of the tracks if None.
 
     Raises:
-        ValueError: for hard decisions, losses that have none by their mistakes, scenes that differ in structure, unknown
-            paths, intervals with an end that scenario or configuration refuse, such as a frequency that the frame rate
-            cannot show, or amplitudes above `MAX_AMPLITUDE_M`.
+        ValueError: for hard decisions, losses of them that have no derivative by mistakes, scenes that differ in
+            structure, unknown paths, intervals with an end that scenario or configuration refuse, such as a frequency
+            that the frame rate cannot show, or amplitudes above `MAX_AMPLITUDE_M`.
     """
     scenes = stacked(scenarios, "tune")
     require_kind("tune", "config", config, FilterConfig, "give a FilterConfig with smoothing='soft'.")
