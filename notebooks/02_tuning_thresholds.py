@@ -195,12 +195,13 @@ assert deleted[:2].min() > 10 > 1 > deleted[4:].max()
 # has seen.
 
 # %%
+schedule = Schedule(num_steps=8, pairs_per_step=2)
 tuned = tune(
     scenarios,
     soft_filter,
     THRESHOLDS,
     objective=objective,
-    schedule=Schedule(num_steps=8, pairs_per_step=2),
+    schedule=schedule,
     seeds=Seeds(choosing=4, held_out=20),
     key=jax.random.key(0),
 )
@@ -210,8 +211,8 @@ for number, step in enumerate(descent, start=1):
         f"step {number}: Th₁ {step.parameters[TH1]:5.2f}, Th₂ {step.parameters[TH2]:5.2f}, temperature "
         f"{step.temperature:.2f}, smoothed objective {step.loss:.2f} ± {step.loss_se:.2f}"
     )
-end = end_of(problem_of(scenarios, soft_filter, THRESHOLDS, objective), descent)
-print(f"end, a mean over the last steps: Th₁ {end[TH1]:.1f}, Th₂ {end[TH2]:.1f}")
+end = end_of(problem_of(scenarios, soft_filter, THRESHOLDS, objective), schedule, descent)
+print(f"end, a mean of where the last steps led: Th₁ {end[TH1]:.1f}, Th₂ {end[TH2]:.1f}")
 assert tuned.num_runs == 64 and tuned.num_failed == 0
 assert tuned.choice.after == end and 9 < max(end.values()) < 25
 

@@ -105,8 +105,8 @@ assert spread[0] < 1.3 < 1.6 < spread[1]
 # The test (a generalised likelihood ratio, `vcjax/gates/velocity_glr.py`) keeps for each landmark what a constant
 # velocity would have done to its innovations by now, and compares it with what they are: a number that follows χ² with
 # three degrees of freedom for a static feature, and grows for a mover as the information on its velocity does. Above 24
-# a feature is flagged; above 7.8 it is suspect, and corrects nothing until it is flagged or falls below. For this picture
-# nobody is flagged or suspect, so that the numbers go on.
+# a feature is flagged; above 7.8 it is suspect, and corrects nothing until it is flagged or falls below. For this
+# picture nobody is flagged or suspect, so that the numbers go on.
 
 # %%
 

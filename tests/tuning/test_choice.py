@@ -166,8 +166,8 @@ def test_tuning_descends_from_each_start_chooses_and_goes_on_where_it_stopped(tm
     first, second = whole.descents
     assert first[0].parameters == {TH1: pytest.approx(1.0), TH2: pytest.approx(0.7)}
     assert second[0].parameters != first[0].parameters and first[0].loss != second[0].loss
-    problem = problem_of(SCENES, SOFT, INTERVALS, OBJECTIVE)
-    ends = [setting_of(SCENES, SOFT, [TH1, TH2]), *(end_of(problem, steps) for steps in whole.descents)]
+    problem, schedule = problem_of(SCENES, SOFT, INTERVALS, OBJECTIVE), Schedule(num_steps=2, pairs_per_step=1)
+    ends = [setting_of(SCENES, SOFT, [TH1, TH2]), *(end_of(problem, schedule, steps) for steps in whole.descents)]
     for path in (TH1, TH2):
         np.testing.assert_allclose(whole.choice.candidates[path], [end[path] for end in ends], rtol=1e-12)
     assert whole.choice.after in ends

@@ -58,8 +58,8 @@ class Schedule(eqx.Module):
     pairs_per_step: int = eqx.field(static=True, default=4)
     """Seeds of each scene that a step averages; each gives a pair of runs."""
     learning_rate: float = eqx.field(converter=number, default=0.2)
-    """How far x goes in the first step, and half of how far later ones may; it falls to a tenth by a cosine.
-    Positive."""
+    """How far x goes in the first step. Where the gradient grows more certain and keeps its sign, later steps are up to
+    some four times as long; they fall to a tenth by a cosine. Positive."""
     temperature_start: float = eqx.field(converter=number, default=1.0)
     """τ of the smoothing in the first step, in χ² units; positive."""
     temperature_end: float = eqx.field(converter=number, default=0.25)
@@ -154,14 +154,19 @@ def descend(
     return history
 
 
-def end_of(problem: Problem, history: Sequence[Step]) -> dict[str, float]:
-    """Where a descent has led: the mean of the free numbers over its last quarter, which averages the noise out.
+def end_of(problem: Problem, schedule: Schedule, history: Sequence[Step]) -> dict[str, float]:
+    """Where a descent has led: the mean of the free numbers after each step of its last quarter, less noisy than one.
 
     References:
         Polyak, Juditsky 1992, "Acceleration of stochastic approximation by averaging".
     """
-    last = history[-max(1, len(history) // 4) :]
-    return problem.to_parameters(np.mean([problem.to_free(step.parameters) for step in last], axis=0))
+    optimiser, places = schedule.optimiser(), []
+    free = problem.to_free(history[0].parameters)
+    state = optimiser.init(jnp.asarray(free))
+    for step in history:
+        free, state = _move(optimiser, free, state, step)
+        places.append(free)
+    return problem.to_parameters(np.mean(places[-max(1, len(history) // 4) :], axis=0))
 
 
 def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any, step: Step) -> tuple[np.ndarray, Any]:

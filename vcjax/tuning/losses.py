@@ -7,9 +7,10 @@ of a track, seen in several frames, it is 1 - (1 - p_detector) Π (1 - p): calle
 Whose statistic hardly changes from one frame to the next, so that its largest p_detector counts, once. Of a hard or
 straight-through run the losses of the tracks are those of the features deleted.
 
-A degree nearer than 1e-9 to 0 or 1 counts as that near where its logarithm is taken: there `cross_entropy` and
-`ranking_loss` do not change any more, and have no derivative. So they have none at all of a straight-through run, whose
-degrees are 0 and 1 (F1 has one), and of a soft one none by mistakes of more than about 20 τ.
+A degree nearer than 1e-9 to 0 or 1 counts as that near where its logarithm is taken. So of a straight-through run,
+whose degrees are 0 and 1, `cross_entropy` has no derivative by its mistakes, which are cut off, but one by what is
+right, and `ranking_loss` one by ties only: neither says how to do better, as that of F1 does. Of a soft run the same
+befalls mistakes of more than about 20 τ.
 """
 
 from typing import NamedTuple

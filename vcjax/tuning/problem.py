@@ -75,9 +75,9 @@ def problem_of(
         objective: what to make small; soft F1 of the tracks if None.
 
     Raises:
-        ValueError: for hard decisions, losses without a derivative by these, scenes that differ in structure, unknown
-            paths, intervals with an end that scenario or configuration refuse, such as a frequency that the frame rate
-            cannot show, or amplitudes above `MAX_AMPLITUDE_M`.
+        ValueError: for hard decisions, losses of them that have no derivative by mistakes, scenes that differ in
+            structure, unknown paths, intervals with an end that scenario or configuration refuse, such as a frequency
+            that the frame rate cannot show, or amplitudes above `MAX_AMPLITUDE_M`.
     """
     scenes = stacked(scenarios, "tune")
     require_kind("tune", "config", config, FilterConfig, "give a FilterConfig with smoothing='soft'.")
@@ -94,7 +94,7 @@ def problem_of(
             if getattr(objective, name) > 0:
                 raise ValueError(
                     f"tune(objective.{name}={getattr(objective, name):g}): of hard decisions, which straight_through "
-                    "keeps, it has no derivative; take smoothing='soft', or weigh F1 instead."
+                    "keeps, it has no derivative by mistakes; take smoothing='soft', or weigh F1 instead."
                 )
     remedy = "give at least one path with its interval, a mapping."
     require_kind("tune", "parameters", parameters, Mapping, remedy)

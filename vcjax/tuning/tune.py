@@ -135,7 +135,7 @@ def tune(
                     raise
             kept[number].write(None)
         left_out.append(start)
-    candidates = [starts[0], *(end_of(problem, steps) for steps in descents)]
+    candidates = [starts[0], *(end_of(problem, schedule, steps) for steps in descents)]
     place = None if directory is None else _choice_of(directory, len(candidates))
     choice = choose(scenarios, config, candidates, directory=place, progress=progress, **given)
     runs_per_step = 2 * schedule.pairs_per_step * len(scenarios)
