@@ -10,6 +10,7 @@ import pytest
 import tiny_runs
 from hypothesis import given
 from hypothesis import strategies as st
+from quick import QUICK
 
 from vcjax.tuning import descent as module
 from vcjax.tuning.descent import Schedule, descend, end_of
@@ -127,6 +128,115 @@ def test_the_end_is_the_mean_after_each_step_of_the_last_quarter_in_the_free_num
     steps = [module.Step(dict(START), 1.0, size, 0.0, {}, {}, {}, 0) for size in sizes]
     expected = start + np.cumsum(sizes)[6:].mean()
     np.testing.assert_allclose(PROBLEM.to_free(end_of(PROBLEM, Schedule(num_steps=8), steps)), expected, rtol=1e-9)
+
+
+def broken_after(num_calls: int, monkeypatch):
+    """Runs that went non-finite: all of them after so many calls, all but one of four pairs before."""
+    calls = []
+
+    def run_lanes(*_, **__):
+        calls.append(len(calls))
+        losses = np.array([1.0, 2.0, np.nan, 3.0, *(np.nan,) * 4])
+        runs = {"loss": losses, "gradient": np.ones((8, 3)), "shift": np.ones((8, 3))}
+        return runs if len(calls) <= num_calls else {name: np.full_like(v, np.nan) for name, v in runs.items()}
+
+    monkeypatch.setattr(module, "run_lanes", run_lanes)
+
+
+def test_of_many_parameters_the_derivative_is_taken_in_reverse_mode():
+    """And is that of forward mode."""
+    more = {"config.gate.th2": Interval(0.1, 10.0, is_log=True), "config.pixel_std_px": Interval(0.5, 2.0)}
+    many = problem_of(SCENES, SOFT, PARAMETERS | more, OBJECTIVE)
+    assert many.config.reverse_mode and not PROBLEM.config.reverse_mode
+    forward = eqx.tree_at(lambda p: p.config, many, PROBLEM.config)
+    free = jnp.asarray(many.to_free(START | {"config.gate.th2": 0.7, "config.pixel_std_px": 1.0}))
+    lane, temperature = {"scene": jnp.asarray(0), "sign": jnp.asarray(1.0)}, jnp.asarray(1.0)
+    found, expected = (
+        jax.jit(module._value_and_gradient, compiler_options=QUICK)(problem, free, 0.1 * free, temperature, lane, KEY)
+        for problem in (many, forward)
+    )
+    np.testing.assert_allclose(found["loss"], expected["loss"], rtol=1e-9)
+    np.testing.assert_allclose(found["gradient"], expected["gradient"], rtol=1e-6, atol=1e-9)
+    assert np.all(np.abs(expected["gradient"]) > 1e-6)
+
+
+def test_what_goes_non_finite_is_left_out_and_counted(monkeypatch):
+    broken_after(1, monkeypatch)
+    first, *rest = descend(PROBLEM, START, dataclasses.replace(ONE_STEP, num_steps=3), key=KEY)
+    assert (first.loss, first.num_failed) == (1.5, 3)
+    assert list(first.gradient.values()) == [1.0, 1.0, 1.0]  # of a single pair the pathwise one alone
+    assert all(step.num_failed == 4 and np.isnan(step.loss) for step in rest)
+    assert rest[0].parameters == rest[1].parameters  # no step was taken from there
+
+
+def test_no_step_is_taken_along_a_gradient_that_is_not_finite():
+    """Nor does the optimiser remember it."""
+    optimiser, free = ONE_STEP.optimiser(), np.array([0.1, -0.2, 0.3])
+    state = optimiser.init(jnp.asarray(free))
+    step = module.Step(START, 1.0, 0.5, 0.1, dict.fromkeys(START, 1.0), dict.fromkeys(START, 0.5), {}, 0)
+    moved, moved_state = module._move(optimiser, free, state, step)
+    assert np.all(moved < free)
+    for gradient in (np.nan, np.inf, -np.inf):
+        broken = step._replace(gradient=step.gradient | {A: gradient})
+        found, found_state = module._move(optimiser, moved, moved_state, broken)
+        np.testing.assert_array_equal(found, moved)
+        assert found_state is moved_state
+
+
+def test_an_objective_that_is_not_finite_at_the_start_is_refused(monkeypatch):
+    broken_after(0, monkeypatch)
+    with pytest.raises(ValueError, match=r"not finite at the start, {'config.gate.th1': 1.0"):
+        descend(PROBLEM, START, ONE_STEP, key=KEY)
+
+
+def test_bad_problems_are_refused(unchecked):
+    for arguments, message in (
+        ({"config": tiny_runs.config()}, r"smoothing='hard'.*'soft' or 'straight_through'"),
+        ({"config": None}, "give a FilterConfig with smoothing"),
+        ({"scenarios": {}}, "give at least one scene"),
+        ({"scenarios": [tiny_runs.scenario()]}, r"tune\(scenarios=<list>\): give at least one scene by its name"),
+        ({"scenarios": {"a": 3}}, r"tune\(scenarios\['a'\]=3\): give a Scenario"),
+        ({"scenarios": {"batch": BATCH}}, r"tune, scenarios\['batch'\]: .* has shape \(2,\), but one number"),
+        ({"objective": 3}, r"tune\(objective=3\): give an Objective"),
+        ({"scenarios": SCENES | {"long": tiny_runs.scenario(num_frames=13)}}, "differ in more than numbers"),
+        ({"parameters": {}}, "at least one path with its interval"),
+        ({"parameters": {"config.gate.th3": Interval(0, 1)}}, "no numeric leaf 'config.gate.th3'; choose among: "),
+        ({"parameters": {TH1: (1, 2)}}, "give an Interval"),
+        ({"parameters": [TH1]}, r"tune\(parameters=.*at least one path with its interval"),
+        ({"parameters": {F: Interval(0.5, 5.5)}}, r"from 0.5 to 5.5: .*not below half the frame rate of 10"),
+        ({"parameters": {F: Interval(0.5, 5.0)}}, r"from 0.5 to 5: .*not below half the frame rate of 10"),
+        ({"parameters": {F: Interval(-1.0, 4.0)}}, r"from -1 to 4: Oscillation\(frequency_hz=-1.0\)"),
+        ({"parameters": {A: Interval(-0.1, 0.4)}}, r"from -0.1 to 0.4: Oscillation\(amplitude_m=-0.1\)"),
+        ({"parameters": {TH1: Interval(0.0, 4.0)}}, r"from 0 to 4: VirtualCorrection\(th1=0.0\)"),
+        (
+            {"parameters": {"config.pixel_std_px": Interval(-1.0, 4.0)}},
+            r"from -1 to 4: FilterConfig\(pixel_std_px=-1.0",
+        ),
+        ({"parameters": {"config.temperature": Interval(1.0, 4.0)}}, "the schedule sets it"),
+        ({"parameters": {A: Interval(0.0, 3.0)}}, r"from 0 to 3: A is a swing of the camera, between 0 and 0.5 m"),
+    ):
+        given = {"scenarios": SCENES, "config": SOFT, "parameters": PARAMETERS} | arguments
+        with pytest.raises(ValueError, match=message):
+            problem_of(**given)
+    for make, message in (
+        (lambda: Interval(2.0, 1.0), "above low=2"),
+        (lambda: Interval(0.0, 1.0, is_log=True), "logarithmic scale needs a positive number"),
+        (lambda: Schedule(pairs_per_step=0), "pairs_per_step=0"),
+        (lambda: Interval(1.0, 2.0, spread=0.0), r"spread=0.0\).*positive"),
+        (lambda: Schedule(temperature_end=0.0), r"temperature_end=0.0\).*positive"),
+        (
+            lambda: PROBLEM.to_free(START | {TH1: 60.0}),
+            r"config.gate.th1: Interval\(0.2, 50\): 60 is not inside; widen",
+        ),
+        (lambda: descend(PROBLEM, START, ONE_STEP, key=0), r"key=0\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+
+
+def test_an_end_may_be_the_last_number_that_is_valid():
+    ends = {A: Interval(0.0, 0.5), F: Interval(0.0, 4.999), "config.gate.th2": Interval(0.0, 9.0)}
+    assert problem_of(SCENES, SOFT, ends).paths == tuple(ends)
 
 
 def test_the_numbers_of_the_paper_are_inside():
