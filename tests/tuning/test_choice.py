@@ -228,7 +228,7 @@ def broken_at(*starts: int):
             raise descent.NotFinite(f"the objective is not finite at the start, {start}; start elsewhere.")
         nan = dict.fromkeys(start, np.nan)
         steps = list(history) or [
-            descent.Step(dict(start), 1.0, 0.5, np.nan, dict.fromkeys(start, 0.1), {}, {}, 1),
+            descent.Step(dict(start), 1.0, 0.5, np.nan, dict.fromkeys(start, 0.1), dict.fromkeys(start, 0.02), {}, 1),
             descent.Step(dict(start), 0.5, np.nan, np.nan, nan, nan, nan, 2),
         ]
         progress(steps)
