@@ -68,7 +68,7 @@ def stops(runs: list[dict[str, np.ndarray]]) -> str:
     """Of movers that stand for a while: who was followed then, handed back, flagged again."""
     num_followed, too_early, back_after, again_after, errors = 0, 0, [], [], []
     for run in runs:
-        for mover in np.flatnonzero(run["moves"].any(axis=0)):
+        for mover in np.flatnonzero(run["moves"].any(axis=0)).tolist():
             stands = np.flatnonzero(~run["moves"][:, mover])
             stop, start = stands[0], stands[-1] + 1
             back = events(run, "handed_back", mover)
@@ -100,8 +100,9 @@ def never_stop(runs: list[dict[str, np.ndarray]]) -> str:
     for run in runs:
         moves = run["moves"].any(axis=0)
         for name, counts in (("deleted", flagged), ("handed_back", back)):
-            for feature in run[name][run[name] >= 0]:
-                counts[bool(moves[feature])] += 1
+            is_mover = moves[run[name][run[name] >= 0]]
+            counts[True] += int(is_mover.sum())
+            counts[False] += int((~is_mover).sum())
     return f"{back[True]} of {flagged[True]} movers flagged and {back[False]} of {flagged[False]} others handed back"
 
 

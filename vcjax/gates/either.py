@@ -35,9 +35,10 @@ class Either(AbstractDetector):
 
     def suspicion(self, state: PyTree) -> Float[Array, "*L"] | None:
         """The larger, of those that suspect anybody."""
-        found = self.first.suspicion(state[0]), self.second.suspicion(state[1])
-        first, *others = [each for each in found if each is not None] or [None]
-        return jnp.fmax(first, others[0]) if others else first
+        first, second = self.first.suspicion(state[0]), self.second.suspicion(state[1])
+        if first is None or second is None:
+            return second if first is None else first
+        return jnp.fmax(first, second)
 
     def velocity(self, state: PyTree) -> tuple[Float[Array, "*L 3"], Float[Array, "*L 3 3"]] | None:
         """That of the first that estimates one."""

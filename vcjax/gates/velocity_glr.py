@@ -115,8 +115,9 @@ class VelocityGLR(AbstractDetector):
             require(self, "threshold", lambda t: t > 0, "give a positive χ²₃ value (16.3 is 99.9 %), or None.")
         if self.suspect is not None:
             require(self, "suspect", lambda t: t > 0, "give a positive χ²₃ value (7.8 is 95 %), or None.")
-            given = (self.suspect, self.threshold)
-            if all(map(is_concrete, given)) and self.threshold is not None and np.any(np.greater_equal(*given)):
+            suspect, threshold = self.suspect, self.threshold
+            is_told = threshold is not None and is_concrete(suspect) and is_concrete(threshold)
+            if is_told and np.any(np.asarray(suspect) >= np.asarray(threshold)):
                 raise ValueError(
                     f"VelocityGLR(suspect={np.asarray(self.suspect).tolist()}, "
                     f"threshold={np.asarray(self.threshold).tolist()}): who is flagged was suspect before; give a "
