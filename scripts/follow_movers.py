@@ -98,9 +98,9 @@ def never_stop(runs: list[dict[str, np.ndarray]]) -> str:
     """Of what was flagged, movers and others: how much was handed back."""
     flagged, back = {True: 0, False: 0}, {True: 0, False: 0}
     for run in runs:
-        moves = run["moves"].any(axis=0)
+        moves = np.any(run["moves"], axis=0)
         for name, counts in (("deleted", flagged), ("handed_back", back)):
-            is_mover = moves[run[name][run[name] >= 0]]
+            is_mover = np.take(moves, run[name][run[name] >= 0])
             counts[True] += int(is_mover.sum())
             counts[False] += int((~is_mover).sum())
     return f"{back[True]} of {flagged[True]} movers flagged and {back[False]} of {flagged[False]} others handed back"
