@@ -124,6 +124,12 @@ def test_inspect_prints_and_draws(tmp_path, capsys):
     assert (tmp_path / "a_overview.png").stat().st_size > 10_000 and f"wrote {tmp_path / 'a_overview.png'}" in told
     assert main(["inspect", str(path), "--picture", str(tmp_path / "b" / "c.png")]) == 0
     assert (tmp_path / "b" / "c.png").exists()
+    said(capsys)
+    image = tmp_path / "image.png"
+    image.write_bytes(b"mine")
+    save_recording(path, load_recording(path)._replace(image_paths=("image.png",) * 30))
+    assert main(["inspect", str(path), "--picture", str(image)]) == 1 and image.read_bytes() == b"mine"
+    assert_one_line(said(capsys)[1], "image.png", "one of the files that are read")
 
 
 def test_run_writes_all_that_there_is_to_see(results, capsys):

@@ -26,6 +26,7 @@ class Inspect:
         """Read, print, draw."""
         content = load_recording(self.recording)
         picture = self.picture or self.recording.with_name(f"{self.recording.stem}_overview.png")
-        check_writable(picture, [self.recording])
+        images = [self.recording.parent / path for path in content.image_paths or ()]
+        check_writable(picture, [self.recording, *images])
         print(summary(content))
         say(console, f"wrote {write_picture(draw_overview(content), picture)}")
