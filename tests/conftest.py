@@ -32,3 +32,28 @@ def unchecked():
 def golden():
     """The contents of a file of tests/golden, by its name."""
     return cache(lambda name: json.loads((Path(__file__).parent / "golden" / name).read_text()))
+
+
+@pytest.fixture(scope="session")
+def folder():
+    """Rendered images with their calibration, as `plain_folder` finds them."""
+    from rendered import rendered
+
+    return rendered().sequence.paths[0].parent.parent
+
+
+@pytest.fixture(scope="session")
+def results(tmp_path_factory):
+    """What `vcjax run` writes of them."""
+    import recorded
+
+    from vcjax.cli import main
+
+    out = tmp_path_factory.mktemp("run") / "vc"
+    jaxtyping.config.update("jaxtyping_disable", True)  # as `unchecked` does for a test
+    try:
+        command = ["run", str(recorded.recording_path()), *recorded.OPTIONS, "--out", str(out), "--pictures", "2"]
+        assert main(command) == 0
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+    return out

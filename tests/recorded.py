@@ -56,3 +56,8 @@ def run() -> Filtered:
 def position_rms(path: np.ndarray) -> float:
     """RMS distance of a path of the robot from the true one, m."""
     return float(np.sqrt(np.mean(np.sum((path[:, :3] - rendered().truth.robot[:, :3]) ** 2, axis=1))))
+
+
+def contents(folder) -> dict[str, bytes]:
+    """Every file in a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

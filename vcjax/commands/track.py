@@ -1,6 +1,7 @@
 """`vcjax track`: from images to a recording."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Literal
 
@@ -61,7 +62,7 @@ class Track:
         """Read, follow, save, say what came out."""
         # Whatever lies in the folder may be read, but for recordings, which people keep there.
         lying = (path for path in self.folder.rglob("*") if path.suffix.lower() != ".npz")
-        check_writable(self.out, (self.calibration, *lying))
+        check_writable(self.out, itertools.chain((self.calibration,), lying))
         for name, least in (("first", 0), ("step", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"--{name} {getattr(self, name)}: give a whole number of at least {least}.")

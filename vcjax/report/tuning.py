@@ -65,8 +65,9 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
 def write_search(choice: Choice, directory: Path) -> list[Path]:
     """Write `sweep.nc` (all runs of the grid), `sweep.json`, `sweep.md` and the figures of a search into a directory.
 
-    `sweep.json` is a `comparison`, `after` being the best point of the grid, with the means over all scenes and seeds
-    of every point: `grid`; what was `wanted`, the weights of the objective; and the `origin` of it all.
+    `sweep.json` is a `comparison`, `after` being the best point of the grid, or `before` where none is better; with the
+    means over all scenes and seeds of every point: `grid`; what was `wanted`, the weights of the objective; and the
+    `origin` of it all.
 
     Returns: the paths written.
 

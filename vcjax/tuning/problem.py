@@ -18,7 +18,7 @@ from vcjax.tuning.losses import Objective
 MAX_AMPLITUDE_M = 0.5
 """How far a camera on a robot can be thought to swing to either side, m."""
 FORWARD_MODE_UP_TO = 4
-"""Numbers up to which forward mode costs no more than reverse mode, whose cost does not depend on them."""
+"""Numbers up to which forward mode costs about as much as reverse mode, whose cost does not depend on them."""
 
 
 class Problem(eqx.Module):
