@@ -86,23 +86,38 @@ def test_a_step_averages_both_estimates_over_the_pairs_and_goes_down():
     np.testing.assert_allclose(list(step.gradient_se.values()), np.sqrt(variance(both) / 4), rtol=1e-3)
 
 
-def test_steps_go_down_the_gradient_in_units_of_its_errors_and_norm():
-    """Against plain NumPy: the first step is as long as the learning rate, later ones remember those before."""
+def test_steps_go_down_the_gradient_in_units_of_its_errors():
+    """Against plain NumPy: as long as the learning rate where that is sure, and shorter where it is not."""
     schedule = dataclasses.replace(ONE_STEP, num_steps=4)
     steps = descend(PROBLEM, START, schedule, key=KEY)
     assert steps[0].parameters == {path: pytest.approx(value) for path, value in START.items()}
-    free, momentum = PROBLEM.to_free(START), np.zeros(3)
-
-    def sure(step):
-        return np.array(list(step.gradient.values())) / np.array(list(step.gradient_se.values()))
-
-    squared = np.sum(np.square(sure(steps[0])))
+    free = PROBLEM.to_free(START)
     for k, step in enumerate(steps):
         np.testing.assert_allclose(PROBLEM.to_free(step.parameters), free, rtol=1e-7, atol=1e-9)
-        gradient = sure(step)
-        squared = 0.9 * squared + 0.1 * gradient @ gradient
-        momentum = 0.5 * momentum + gradient / (np.sqrt(squared) + 1e-6)
-        free = free - 0.2 * (0.1 + 0.9 * (1 + np.cos(np.pi * k / 4)) / 2) * momentum
+        in_errors = np.array(list(step.gradient.values())) / np.array(list(step.gradient_se.values()))
+        certainty = min(1.0, np.sqrt(np.mean(in_errors**2) / 2))
+        rate = 0.2 * (0.1 + 0.9 * (1 + np.cos(np.pi * k / 4)) / 2)
+        free = free - rate * certainty * in_errors / np.linalg.norm(in_errors)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "error", "length"),
+    [
+        ([3.0, 4.0, 0.0], [1.0, 1.0, 1.0], 0.2),  # 5 errors: as long as the learning rate
+        ([0.3, 0.4, 0.0], [1.0, 1.0, 1.0], 0.2 * 0.5 / np.sqrt(6)),  # half an error in all
+        ([1e-3, 0.0, 0.0], [1e-6, 1.0, 1.0], 0.2),  # small but certain
+        ([1e-3, 2e-3, 0.0], [np.nan] * 3, 0.2),  # errors not known
+        ([0.0, 0.0, 0.0], [np.nan] * 3, 0.0),
+        ([0.0, 0.0, 0.0], [0.0] * 3, 0.0),
+    ],
+)
+def test_a_step_is_as_long_as_it_is_sure(gradient, error, length):
+    paths, free = list(PARAMETERS), np.zeros(3)
+    step = module.Step(START, 1.0, 0.5, 0.1, *(dict(zip(paths, v, strict=True)) for v in (gradient, error)), {}, 0)
+    optimiser = ONE_STEP.optimiser(3)
+    moved, _ = module._move(optimiser, free, optimiser.init(jnp.asarray(free)), step)
+    assert np.linalg.norm(moved) == pytest.approx(length, rel=1e-6)
+    np.testing.assert_allclose(moved[1] * gradient[0], moved[0] * gradient[1], rtol=1e-5, atol=1e-12)
 
 
 def test_steps_draw_new_seeds_the_temperature_falls_and_a_stopped_descent_goes_on():
@@ -171,7 +186,7 @@ def test_what_goes_non_finite_is_left_out_and_counted(monkeypatch):
 
 def test_no_step_is_taken_along_a_gradient_that_is_not_finite():
     """Nor does the optimiser remember it."""
-    optimiser, free = ONE_STEP.optimiser(), np.array([0.1, -0.2, 0.3])
+    optimiser, free = ONE_STEP.optimiser(3), np.array([0.1, -0.2, 0.3])
     state = optimiser.init(jnp.asarray(free))
     step = module.Step(START, 1.0, 0.5, 0.1, dict.fromkeys(START, 1.0), dict.fromkeys(START, 0.5), {}, 0)
     moved, moved_state = module._move(optimiser, free, state, step)
@@ -250,7 +265,7 @@ def test_a_step_too_far_ends_inside():
     here = PROBLEM.to_parameters(PROBLEM.to_free(START))
     step = module.Step(here, 1.0, 0.5, 0.1, dict.fromkeys(PARAMETERS, 1.0), dict.fromkeys(PARAMETERS, 0.1), nothing, 0)
     schedule = Schedule(learning_rate=1e9)
-    optimiser = schedule.optimiser()
+    optimiser = schedule.optimiser(len(PARAMETERS))
     free = PROBLEM.to_free(START)
     free, _ = module._move(optimiser, free, optimiser.init(jnp.asarray(free)), step)
     there = PROBLEM.to_parameters(free)

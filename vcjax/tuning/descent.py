@@ -3,9 +3,11 @@
 Each parameter lives in an interval and is moved as a free number x (see `intervals`). A step averages the objective and
 its gradient over a mini-batch of seeds, new in every step, and over all scenes. What is followed is the gradient in
 units of its standard errors, (∂L/∂xᵢ)/sᵢ: not how much a parameter matters, but how sure it is which way it has to go,
-so that one whose gradient is mostly noise neither hides the others nor is moved far. It is gone down by NovoGrad:
-momentum, in units of the norm. (Adam has a unit for each parameter, and moves one of which nothing is known by its
-noise as far as the others.) The temperature of the smoothing falls from step to step.
+so that one whose gradient is mostly noise neither hides the others nor is moved far. A step is as long as the learning
+rate where this is sure, and shorter where it drowns in noise: its norm counts up to √2 errors in each parameter. (Units
+that an optimiser learns from earlier gradients are those of the first, steep ones, and too large where it has to
+settle; Adam's, one for each parameter, move one of which nothing is known by its noise as far as the others.) The
+temperature of the smoothing falls from step to step.
 
 The derivative of one long run need not say where the mean of many goes: a run's phase of oscillation depends on f times
 its whole length, and its loss ripples with f over less than a tenth of a hertz, steeply. So what is made small is the
@@ -21,7 +23,6 @@ unbiased no more than nearly. A pair that goes non-finite is left out, and its s
 soft filter says of a setting is not what the hard filter does with it: `choice` looks at that.
 
 References:
-    Ginsburg et al. 2019, "Stochastic gradient methods with layer-wise adaptive moments for training of deep networks".
     Parmas, Rasmussen, Peters, Doya 2018, "PIPPS: Flexible model-based policy search robust to the curse of chaos".
 """
 
@@ -42,8 +43,8 @@ from vcjax.study.sweep import Experiment, replace_at
 from vcjax.tuning.evaluate import scene
 from vcjax.tuning.problem import Problem
 
-_MEMORY = (0.5, 0.9)
-"""Decay rates of the optimiser's momentum and of its scale: there are a dozen steps and not thousands."""
+_SURE = np.sqrt(2.0)
+"""Standard errors in each parameter, as a root mean square, from which on a gradient is as good as certain."""
 _FARTHEST = 12.0
 """How far a free number may go: its parameter is then within 1e-5 of an end of its interval, and not yet at it."""
 _SUREST = 1e-3
@@ -57,9 +58,8 @@ class Schedule(eqx.Module):
     """Steps of the optimiser."""
     pairs_per_step: int = eqx.field(static=True, default=4)
     """Seeds of each scene that a step averages; each gives a pair of runs."""
-    learning_rate: float = eqx.field(converter=number, default=0.2)
-    """How far x goes in the first step. Where the gradient grows more certain and keeps its sign, later steps are up to
-    some four times as long; they fall to a tenth by a cosine. Positive."""
+    learning_rate: float = eqx.field(converter=number, default=0.4)
+    """How far x goes in the first step if its gradient is sure. Later steps fall to a tenth by a cosine. Positive."""
     temperature_start: float = eqx.field(converter=number, default=1.0)
     """τ of the smoothing in the first step, in χ² units; positive."""
     temperature_end: float = eqx.field(converter=number, default=0.25)
@@ -76,10 +76,11 @@ class Schedule(eqx.Module):
         part = step / max(self.num_steps - 1, 1)
         return float(self.temperature_start * (self.temperature_end / self.temperature_start) ** part)
 
-    def optimiser(self) -> optax.GradientTransformation:
-        """What takes the steps."""
-        rates = optax.cosine_decay_schedule(float(self.learning_rate), self.num_steps, alpha=0.1)
-        return optax.novograd(rates, *_MEMORY)
+    def optimiser(self, num_parameters: int) -> optax.GradientTransformation:
+        """What takes the steps, along gradients in units of their standard errors."""
+        sure = float(_SURE * np.sqrt(num_parameters))
+        rates = optax.cosine_decay_schedule(float(self.learning_rate) / sure, self.num_steps, alpha=0.1)
+        return optax.chain(optax.clip_by_global_norm(sure), optax.sgd(rates))
 
 
 class NotFinite(ValueError):
@@ -130,8 +131,8 @@ def descend(
         NotFinite: if the objective is not finite at the start.
     """
     require_key("descend", key)
-    history, optimiser = list(history), schedule.optimiser()
-    free = problem.to_free(start)
+    history, free = list(history), problem.to_free(start)
+    optimiser = schedule.optimiser(len(free))
     state = optimiser.init(jnp.asarray(free))
     for step in history:
         free, state = _move(optimiser, free, state, step)
@@ -160,8 +161,8 @@ def end_of(problem: Problem, schedule: Schedule, history: Sequence[Step]) -> dic
     References:
         Polyak, Juditsky 1992, "Acceleration of stochastic approximation by averaging".
     """
-    optimiser, places = schedule.optimiser(), []
-    free = problem.to_free(history[0].parameters)
+    free, places = problem.to_free(history[0].parameters), []
+    optimiser = schedule.optimiser(len(free))
     state = optimiser.init(jnp.asarray(free))
     for step in history:
         free, state = _move(optimiser, free, state, step)
@@ -170,12 +171,17 @@ def end_of(problem: Problem, schedule: Schedule, history: Sequence[Step]) -> dic
 
 
 def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any, step: Step) -> tuple[np.ndarray, Any]:
-    """One step along the gradient in units of its errors; none where loss or gradient is not finite."""
+    """One step along the gradient in units of its errors; none where loss or gradient is not finite.
+
+    Of a single pair the errors are not known, and it is taken for sure.
+    """
     gradient, error = (np.array(list(each.values())) for each in (step.gradient, step.gradient_se))
     if not np.all(np.isfinite([step.loss, *gradient])):
         return free, state
+    is_known = np.all(np.isfinite(error))
+    error = error if is_known else np.full(len(error), _SUREST * np.linalg.norm(gradient))
     sure = gradient / np.maximum(error, _SUREST * np.abs(gradient) + np.finfo(float).tiny)
-    update, state = optimiser.update(jnp.asarray(sure if np.all(np.isfinite(error)) else gradient), state, free)
+    update, state = optimiser.update(jnp.asarray(sure), state, free)
     return np.clip(free + np.asarray(update), -_FARTHEST, _FARTHEST), state
 
 
