@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
+from vcjax.report import tuning as module
 from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.descent import descent_figure
 from vcjax.report.detection_curves import curves_figure, roc_by_scene_figure
@@ -146,6 +147,20 @@ def test_figures_of_one_scene_have_their_titles_whole(choice):
         box = figure._suptitle.get_window_extent()
         assert box.x0 >= 0 and box.x1 <= figure.bbox.width
     assert "scenes" not in curves_figure(one)._suptitle.get_text()
+
+
+def test_figures_tell_what_they_cannot_show(choice, tmp_path, monkeypatch):
+    """Curves without movers; and a best point where nothing is better than before."""
+    static = choice.held_out.assign(track_score=choice.held_out.track_score.where(~choice.held_out.is_moving))
+    for held_out, expected in ((static, ["no mover was measured"]), (choice.held_out, [])):
+        figure = curves_figure(choice._replace(held_out=held_out))
+        assert [[text.get_text() for text in axes.texts] for axes in figure.axes] == [expected, expected]
+    marks = []
+    monkeypatch.setattr(module, "landscape_figure", lambda grid, title, given: marks.append(given) or figure)
+    for after in (choice.after, choice.before):
+        write_search(choice._replace(after=after), tmp_path)
+    assert marks[0] == {"before": choice.before, "best point": choice.after}
+    assert marks[-1] == {"before, nothing is better": choice.before}
 
 
 def test_a_descents_figure_names_its_numbers_as_the_landscape_does():

@@ -115,10 +115,11 @@ def test_a_candidate_with_a_run_that_failed_is_not_chosen(found, monkeypatch):
 
 
 def test_the_landscape_around_a_setting_keeps_the_other_numbers(found):
+    """At the middles of cells that fill the intervals."""
     setting = {TH1: 3.0, TH2: 0.7, "scenario.oscillation.amplitude_m": 0.02}
     grid = around(SCENES, SOFT, setting, INTERVALS, objective=OBJECTIVE, num_points=2, num_seeds=2, key=KEY)
     assert grid.loss.dims == (TH1, TH2, "scene", "seed") and grid.loss.shape == (2, 2, 2, 2)
-    np.testing.assert_allclose(grid[TH1], [0.2 * 250**0.02, 0.2 * 250**0.98])
+    np.testing.assert_allclose(grid[TH1], [0.2 * 250**0.25, 0.2 * 250**0.75])
 
 
 def test_runs_that_all_fail_are_refused(found, monkeypatch):

@@ -60,7 +60,12 @@ def _tracks(choice: Choice) -> list[dict[str, roc.Tracks]]:
 
 
 def draw_curve(axes: Axes, levels: np.ndarray, curve, tracks: roc.Tracks, label: str, style: dict) -> None:
-    """`roc.recall_at` or `precision_at` with its pointwise 95 % band by bootstrap over seeds."""
+    """`roc.recall_at` or `precision_at` with its pointwise 95 % band by bootstrap over seeds; a word where none is."""
+    if np.all(np.isnan(curve(tracks, levels)[0])):
+        axes.plot([], [], label=label, **style)
+        if not axes.texts:
+            axes.text(0.5, 0.5, "no mover was measured", transform=axes.transAxes, ha="center")
+        return
     low, high = roc.interval(roc.resampled(curve, tracks, levels, _RESAMPLES))
     axes.plot(levels, curve(tracks, levels)[0], label=label, **style)
     axes.fill_between(levels, low, high, color=style["color"], alpha=0.18, linewidth=0)

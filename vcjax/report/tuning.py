@@ -16,7 +16,7 @@ from vcjax.report.style import write_figure
 from vcjax.storage import check_writable, write_file, write_json
 from vcjax.study.results import save
 from vcjax.study.summary import mean_and_error
-from vcjax.tuning.choice import Choice
+from vcjax.tuning.choice import Choice, Setting
 from vcjax.tuning.landscape import as_grid, means
 from vcjax.tuning.losses import SHAPES
 from vcjax.tuning.tune import Tuned
@@ -53,7 +53,7 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     paths = _write(compared, title, directory / "tune")
     folder = directory / "figures"
     paths += write_figure(descent_figure(tuned.descents), folder / "descent")
-    marks = {"before": tuned.choice.before, "after": tuned.choice.after}
+    marks = _marks(tuned.choice, "after")
     for name, grid in landscapes.items():
         others = {path: value for path, value in tuned.choice.after.items() if path not in grid.dims}
         title = f"Hard decisions, {_means(grid)}" + (", the other numbers as tuned" if others else "")
@@ -81,7 +81,7 @@ def write_search(choice: Choice, directory: Path) -> list[Path]:
     paths = [save(grid, directory / "sweep.nc")]
     title = f"# Best point of a grid of {points.loss.size}\n\n{_runs(compared)}\n{_weights(compared)}"
     paths += _write(compared, title, directory / "sweep")
-    folder, marks = directory / "figures", {"before": choice.before, "best point": choice.after}
+    folder, marks = directory / "figures", _marks(choice, "best point")
     paths += write_figure(landscape_figure(grid, f"Hard decisions, {_means(grid)}", marks), folder / "landscape")
     for number, name in enumerate(grid.scene.values, start=1):
         one = grid.sel(scene=[name])
@@ -112,6 +112,13 @@ def _write_curves(choice: Choice, folder: Path) -> list[Path]:
         *write_figure(curves_figure(choice), folder / "curves"),
         *write_figure(roc_by_scene_figure(choice), folder / "roc_by_scene"),
     ]
+
+
+def _marks(choice: Choice, chosen: str) -> dict[str, Setting]:
+    """Settings by what they are called in figures."""
+    if choice.after == choice.before:
+        return {"before, nothing is better": choice.before}
+    return {"before": choice.before, chosen: choice.after}
 
 
 def _means(grid: xr.Dataset) -> str:

@@ -90,7 +90,7 @@ def around(
     directory: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Any:
-    """The landscape over two intervals, where the other numbers of a setting stay as they are.
+    """The landscape over two intervals, at the middles of equal cells; the other numbers of a setting stay as they are.
 
     Args:
         scenarios: scenes by name.
@@ -106,7 +106,8 @@ def around(
 
     Returns: runs (x, y, scene, seed), as `as_grid`.
     """
-    axes = [interval.at(np.linspace(0.02, 0.98, num_points)) for interval in intervals.values()]
+    middles = (np.arange(num_points) + 0.5) / num_points
+    axes = [interval.at(middles) for interval in intervals.values()]
     grid = dict(zip(intervals, (axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")), strict=True))
     rest = {path: np.full(num_points**2, value) for path, value in setting.items() if path not in grid}
     runs = evaluate(
