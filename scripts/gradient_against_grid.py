@@ -51,6 +51,8 @@ class Study:
     """Runs of each scene on which the two are compared."""
     key: int = 0
     """Number of the random keys, of which each of the three parts has its own."""
+    grid_key: int | None = None
+    """Number of the grid's, where a grid that was searched before is compared with other descents; `key` if None."""
     out: Path = Path("results/gradient_against_grid")
     """Directory; work that was stopped goes on there."""
 
@@ -67,7 +69,9 @@ def main(study: Study) -> None:
         axes = {path: np.linspace(i.low, i.high, study.points + 1)[1:] for path, i in intervals.items()}
     schedule = Schedule(num_steps=study.steps, pairs_per_step=study.pairs, learning_rate=study.learning_rate)
     config = vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")
-    gradient_key, grid_key, held_out_key = (jax.random.key(3 * study.key + part) for part in (1, 2, 3))
+    of_grid = study.key if study.grid_key is None else study.grid_key
+    numbers = (3 * study.key + 1, 3 * of_grid + 2, 3 * study.key + 3)
+    gradient_key, grid_key, held_out_key = map(jax.random.key, numbers)
     tuned = tune(
         scenarios,
         config,

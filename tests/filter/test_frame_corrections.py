@@ -265,7 +265,9 @@ def test_a_suspect_has_an_innovation_and_changes_nothing(problem, gate, choice):
         assert not found[is_suspect].any()
         np.testing.assert_array_equal(found, getattr(without, name))
     assert np.isfinite(outcome.innovation.z[is_suspect]).all() and (outcome.innovation.z[is_suspect] != 0).any()
-    assert np.isfinite(outcome.dynamic_margin[is_suspect]).all() and outcome.is_accepted.any()
+    np.testing.assert_array_equal(outcome.is_suspect, is_suspect)
+    np.testing.assert_array_equal(outcome.dynamic_margin, np.where(is_suspect, np.nan, without.dynamic_margin))
+    assert np.isfinite(without.dynamic_margin[~is_suspect]).all() and outcome.is_accepted.any()
 
 
 def supporters_of_the_best(state, slot, uv_px, is_measured, gate):

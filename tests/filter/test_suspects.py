@@ -8,6 +8,8 @@ import numpy as np
 from filter_runs import CAPACITY, filtered, head, recorded
 
 from vcjax.filter.config import FilterConfig
+from vcjax.gates.either import Either
+from vcjax.gates.inlier_ratio import InlierRatio
 from vcjax.gates.velocity_glr import VelocityGLR
 from vcjax.gates.virtual_correction import VirtualCorrection
 
@@ -42,6 +44,7 @@ def test_who_is_suspect_is_left_out_until_it_calms_down():
         suspects = set(np.asarray(before.track_id)[(suspicion > 0) & np.asarray(before.is_mapped)].tolist())
         is_suspect = np.isin(info.candidate_id, list(suspects)) & info.is_measured
         used = info.is_accepted | info.is_recovered
+        np.testing.assert_array_equal(info.is_suspect, is_suspect)
         assert not (used | info.is_dynamic)[is_suspect].any()
         # It is looked at as closely as the others: its innovation is there, and finite.
         assert np.isfinite(info.innovation[is_suspect]).all() and np.isfinite(info.re1[is_suspect]).all()
@@ -52,3 +55,12 @@ def test_who_is_suspect_is_left_out_until_it_calms_down():
     assert num_left_out > 20 and num_back > 5
     flagged = np.concatenate([info.inconsistent_id for _, info in run])
     assert (flagged >= 0).any() and jnp.all(jnp.array([info.is_finite for _, info in run]))
+
+
+def test_no_other_detector_flags_a_landmark_for_having_been_suspect():
+    """Nothing moves; what is left out as suspect has not failed to fit."""
+    both = Either(VelocityGLR(threshold=1e9, suspect=1.0), InlierRatio())
+    config = FilterConfig(gate=VirtualCorrection(), detector=both, max_landmarks=CAPACITY, max_updates=20)
+    infos = [info for _, info in filtered(config, head(recorded(seed=3), NUM_FRAMES))]
+    assert np.sum([info.is_suspect for info in infos]) > 100
+    assert not (np.concatenate([info.inconsistent_id for info in infos]) >= 0).any()

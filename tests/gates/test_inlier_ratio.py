@@ -24,7 +24,10 @@ def random_evidence(seed):
     # Where not searched the rest means nothing: there anything is set.
     is_corrected = np.where(is_searched, is_measured & fits, fits)
     is_visible = rng.random((NUM_FRAMES, NUM_SLOTS)) < 0.8
+    is_suspect = rng.random(shape) < 0.2
+    is_corrected &= ~(is_searched & is_suspect)
     masks = dict(is_searched=is_searched, is_measured=is_measured, is_corrected=is_corrected, is_visible=is_visible)
+    masks["is_suspect"] = is_suspect
     masks = {name: jnp.asarray(value) for name, value in masks.items()}
     return random_record(seed) | {"slot": jnp.asarray(slot)} | masks
 
@@ -40,7 +43,7 @@ def count_plainly(detector, record):
     counts = [[1, 1, 1] for _ in range(NUM_SLOTS)]
     for frame in frames(record):
         for k in range(NUM_CANDIDATES):
-            if frame.is_searched[k]:
+            if frame.is_searched[k] and not frame.is_suspect[k]:
                 count = counts[frame.slot[k]]
                 count[0] += 1
                 count[1] += int(frame.is_measured[k])

@@ -148,7 +148,7 @@ BAD = {
 @pytest.mark.parametrize(("name", "content", "message"), BAD.values(), ids=BAD)
 def test_damaged_folder_is_refused_by_file_and_place(tmp_path, name, content, message):
     write(tmp_path)
-    head = b"track_id,accepted,recovered,dynamic,rejected,deleted,margin,detector_margin\n"
+    head = b"track_id,accepted,recovered,dynamic,rejected,suspect,deleted,margin,detector_margin\n"
     if content is None:
         (tmp_path / name).unlink()
     else:

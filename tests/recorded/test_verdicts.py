@@ -30,6 +30,7 @@ def frame_info(ids, verdict, re1, re2, margin, deleted=(), is_finite=True, is_fu
         "is_accepted": word == "accepted",
         "is_recovered": word == "recovered",
         "is_dynamic": word == "dynamic",
+        "is_suspect": word == "suspect",
         "dynamic_margin": np.array(margin, float),
         "inconsistent_id": np.array([*deleted, *[-1] * (2 - len(deleted))], np.int32),
         "watched_id": np.array([*(i for i, _ in watched), *[-1] * (2 - len(watched))], np.int32),
@@ -46,7 +47,8 @@ def info(unchecked) -> FrameInfo:
                    watched=[(4, -3.0), (5, -1.0)]),
         frame_info([-1, 9, 7], ["", "dynamic", "accepted"], [nan, 30.0, 2.0], [nan, 4.0, nan], [nan, 17.0, -7.0], [4],
                    watched=[(4, 2.0), (7, nan)]),
-        frame_info([7, 3, -1], ["rejected", "accepted", ""], [10, 3, 1], [nan] * 3, [1, -6, nan], [8], True, True),
+        frame_info([7, 3, 5], ["rejected", "accepted", "suspect"], [10, 3, 1], [nan] * 3, [1, -6, nan], [8],
+                   is_full=True),
     ]  # fmt: skip
     # The rest is that of some other run.
     return dataclasses.replace(recorded.run().info, **jax.tree.map(lambda *leaves: np.stack(leaves), *frames))
@@ -62,6 +64,7 @@ def test_rows_by_frame(info):
         (1, 4, nan, nan, nan, "deleted"),
         (2, 7, 10.0, nan, 1.0, "rejected"),
         (2, 3, 3.0, nan, -6.0, "accepted"),
+        (2, 5, 1.0, nan, nan, "suspect"),
         (2, 8, nan, nan, nan, "deleted"),
     ]
     assert np.array(VERDICTS)[found.verdict].tolist() == [row[-1] for row in rows]
@@ -71,18 +74,19 @@ def test_rows_by_frame(info):
 
 def test_tracks_and_classes(info):
     found = track_verdicts(verdicts(info), info)
-    assert found.track_id.tolist() == [3, 4, 7, 8, 9]
-    #                                  accepted, recovered, dynamic, rejected, deleted
+    assert found.track_id.tolist() == [3, 4, 5, 7, 8, 9]
+    #                                  accepted, recovered, dynamic, rejected, suspect, deleted
     assert found.counts.tolist() == [
-        [1, 0, 0, 0, 0],
-        [1, 0, 0, 0, 1],
-        [1, 1, 0, 1, 0],
-        [0, 0, 0, 0, 1],
-        [0, 0, 1, 0, 0],
+        [1, 0, 0, 0, 0, 0],
+        [1, 0, 0, 0, 0, 1],
+        [0, 0, 0, 0, 1, 0],
+        [1, 1, 0, 1, 0, 0],
+        [0, 0, 0, 0, 0, 1],
+        [0, 0, 1, 0, 0, 0],
     ]
-    np.testing.assert_array_equal(found.margin, [-6.0, -8.0, 1.0, nan, 17.0])
-    np.testing.assert_array_equal(found.detector_margin, [nan, 2.0, nan, nan, nan])  # 5 has no verdict
-    assert found.is_called.tolist() == [False, True, False, True, True]
+    np.testing.assert_array_equal(found.margin, [-6.0, -8.0, nan, 1.0, nan, 17.0])
+    np.testing.assert_array_equal(found.detector_margin, [nan, 2.0, -1.0, nan, nan, nan])
+    assert found.is_called.tolist() == [False, True, False, False, True, True]
     kinds = classes(np.array([9, 7, 5, 4, 3, 99]), found)
     assert kinds == ("dynamic", "recovered", "unused", "dynamic", "accepted", "unused")
     nothing = track_verdicts(type(verdicts(info))(*(column[:0] for column in verdicts(info))), info)
@@ -108,9 +112,10 @@ def test_summary_by_hand(info):
         vc.FilterConfig(gate=vc.VirtualCorrection(th1=9.0)), recording, filtered, track_verdicts(verdicts(info), info)
     )
     assert (found["frames"], found["duration_s"], found["times_real_time"]) == (3, 2.0, pytest.approx(10.0))
-    assert [found[name] for name in VERDICTS] == [3, 1, 1, 1, 2]
-    assert (found["measured"], found["tracks_dynamic"], found["landmarks"], found["frames_map_full"]) == (6, 3, 2, 1)
-    assert found["nis"] == pytest.approx(2.0) and found["beyond_gate"] == pytest.approx(0.5)
+    assert [found[name] for name in VERDICTS] == [3, 1, 1, 1, 1, 2]
+    assert (found["measured"], found["tracks_dynamic"], found["landmarks"], found["frames_map_full"]) == (7, 3, 2, 1)
+    # The suspect is within the gate, though not corrected with.
+    assert found["nis"] == pytest.approx(2.0) and found["beyond_gate"] == pytest.approx(3 / 7)
     mean, variance = nis_moments(9.0)
     assert found["nis_high"] - found["nis_low"] == pytest.approx(2 * 1.96 * math.sqrt(variance / 3))
     assert found["nis_high"] + found["nis_low"] == pytest.approx(2 * mean)
@@ -121,7 +126,8 @@ def test_summary_by_hand(info):
     text = run_summary_text(found)
     for words in (
         "0.2 s, 10 times real time; compilation 12.5 s",
-        "3 accepted, 1 recovered of 6 measured",
+        "3 accepted, 1 recovered of 7 measured",
+        "1 rejected without a verdict, 1 suspect to the detector",
         "1 verdicts of the gate, 2 deletions by the detector, of 3 tracks",
         "full in 1 frames",
         "failures         none",
@@ -144,9 +150,9 @@ def test_nothing_is_expected_of_a_gate_that_accepts_jointly(info):
     config = vc.FilterConfig(gate=vc.OnePointRansac())
     found = run_summary(config, recording, filtered, track_verdicts(verdicts(info), info))
     assert all(math.isnan(found[name]) for name in ("nis_low", "nis_high", "beyond_gate_expected"))
-    assert found["nis"] == pytest.approx(2.0) and found["beyond_gate"] == pytest.approx(0.5)
+    assert found["nis"] == pytest.approx(2.0) and found["beyond_gate"] == pytest.approx(3 / 7)
     text = run_summary_text(found)
-    assert "2.000 of the accepted\n" in text and "50.00 % of the measured\n" in text
+    assert "2.000 of the accepted\n" in text and "42.86 % of the measured\n" in text
 
 
 def test_first_failure_is_named(info):

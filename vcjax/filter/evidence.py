@@ -32,6 +32,7 @@ def evidence_of(
         is_searched=is_searched,
         is_measured=is_measured,
         is_corrected=outcome.is_accepted | outcome.is_recovered,
+        is_suspect=outcome.is_suspect,
         weight=outcome.weight,
         innovation=innovation.z,
         innovation_cov=innovation.S,

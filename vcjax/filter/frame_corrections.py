@@ -34,8 +34,10 @@ class Outcome(NamedTuple):
     is_accepted: Bool[Array, " K"]
     is_recovered: Bool[Array, " K"]
     is_dynamic: Bool[Array, " K"]
+    is_suspect: Bool[Array, " K"]
+    """Measured, and by the detector's word neither corrected with nor judged."""
     dynamic_margin: Float[Array, " K"]
-    """By how much a candidate passes what keeps it from being called dynamic, χ²; NaN where not measured."""
+    """By how much a candidate passes what keeps it from being called dynamic, χ²; NaN where not measured or suspect."""
     p_dynamic: Float[Array, " K"]
     """To what degree a candidate is called dynamic; soft, neither accepted nor recovered, if the gate calls any so."""
     weight: Float[Array, " K"]
@@ -66,7 +68,8 @@ def correct_frame(
     predicted, gate = submap, config.gate
     # An unmeasured candidate's pixel may be anything, NaN included; zero keeps derivatives finite.
     uv_px = jnp.where(is_measured[:, None], uv_px, 0.0)
-    is_usable = is_measured if is_suspect is None else is_measured & ~is_suspect
+    is_suspect = jnp.zeros_like(is_measured) if is_suspect is None else is_measured & is_suspect
+    is_usable = is_measured & ~is_suspect
     everyone = jnp.arange(is_measured.shape[0])
     innovation = margin = None
     if isinstance(gate, AbstractJointGate):
@@ -109,7 +112,7 @@ def correct_frame(
     submap = eqx.tree_at(lambda s: s.is_corrected, submap, is_accepted | is_recovered)
     # A gate without verdicts has none to add to the margin by which it leaves out.
     dynamic_margin = jnp.where(is_isolated, jnp.fmin(-margin, verdict.margin), -margin)
-    dynamic_margin = jnp.where(is_measured, dynamic_margin, jnp.nan)
+    dynamic_margin = jnp.where(is_usable, dynamic_margin, jnp.nan)
     weight = (is_accepted | is_recovered).astype(uv_px.dtype)
     p_dynamic = is_dynamic.astype(uv_px.dtype)
     if config.smoothing != "hard":
@@ -121,7 +124,7 @@ def correct_frame(
         weight = soft_weight if is_soft else straight_through(weight, soft_weight)
         p_dynamic = soft_p if is_soft else straight_through(p_dynamic, soft_p)
     return submap, Outcome(
-        innovation, verdict, is_accepted, is_recovered, is_dynamic, dynamic_margin, p_dynamic, weight
+        innovation, verdict, is_accepted, is_recovered, is_dynamic, is_suspect, dynamic_margin, p_dynamic, weight
     )
 
 

@@ -41,10 +41,12 @@ class FrameInfo(eqx.Module):
     """Isolated, then corrected with."""
     is_dynamic: Bool[Array, " K"]
     """Isolated, called dynamic by the gate and deleted."""
+    is_suspect: Bool[Array, " K"]
+    """Measured, and neither corrected with nor judged by the gate, since the detector suspects it."""
     dynamic_margin: Float[Array, " K"]
     """By how much a measured candidate passes what keeps it from being called dynamic, in χ² units: RE₁ - Th₁, and of
     the isolated the gate's verdict as well, whichever is less. Above 0 where dynamic, or, by a gate without verdicts,
-    left out; NaN where not measured."""
+    left out; NaN where not measured or suspect."""
     p_dynamic: Float[Array, " K"]
     """To what degree a measured candidate is called dynamic, in [0, 1]: 1 where it is, else 0; soft, neither accepted
     nor recovered, by a gate that calls any dynamic."""

@@ -157,6 +157,8 @@ class Evidence(eqx.Module):
     """Found in the image. The numbers below are meaningless where this is false, but for the weight, zero."""
     is_corrected: Bool[Array, " K"]
     """Used in a formal correction, accepted or recovered."""
+    is_suspect: Bool[Array, " K"]
+    """Found, and neither corrected with nor judged by the gate, since a detector suspects it."""
     weight: Float[Array, " K"]
     """To what degree it was used, in [0, 1]: 0 or 1 unless the filter is soft (see `surrogates`)."""
     innovation: Float[Array, "K 2"]
@@ -172,7 +174,8 @@ class Evidence(eqx.Module):
     re1: Float[Array, " K"]
     """RE₁ as gated (13)."""
     dynamic_margin: Float[Array, " K"]
-    """By how much it passes what keeps the gate from calling it dynamic or leaving it out, χ² units."""
+    """By how much it passes what keeps the gate from calling it dynamic or leaving it out, χ² units; NaN where
+    suspect."""
     is_visible: Bool[Array, " L"]
     """Mapped and inside the image by its last projection."""
     time_step_s: Float[Array, ""]

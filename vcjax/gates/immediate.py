@@ -15,9 +15,9 @@ from vcjax.gates.gate import AbstractDetector, Evidence
 
 
 class Immediate(AbstractDetector):
-    """Flag a measured candidate that the filter did not correct with: isolated, and not recovered.
+    """Flag a measured candidate that the gate isolated and did not recover.
 
-    Its margin is the gate's, with its derivative.
+    Its margin is the gate's, with its derivative; of whom another detector suspects it says nothing.
     """
 
     def born(self) -> tuple[()]:

@@ -24,8 +24,9 @@ class InlierRatio(AbstractDetector):
     """Flag a visible landmark, searched at least `min_searches` times, that was found or fitted too seldom.
 
     Flagged when measured/searched < `min_measured_ratio` or corrected/measured < `min_corrected_ratio`. All counts
-    start at one. Its margin is the larger of the two ratios' deviances, the χ²₁ statistic of a binomial share k/n held
-    against its bound p, 2 n KL(k/n ‖ p), with the sign of p - k/n; its derivative is zero.
+    start at one; frames in which another detector suspects the landmark do not count. Its margin is the larger of the
+    two ratios' deviances, the χ²₁ statistic of a binomial share k/n held against its bound p, 2 n KL(k/n ‖ p), with
+    the sign of p - k/n; its derivative is zero.
     """
 
     min_searches: float = eqx.field(converter=number, default=10.0)
@@ -50,7 +51,8 @@ class InlierRatio(AbstractDetector):
         """Count this frame's candidates and compare the ratios with their bounds."""
 
         def count(total, happened):
-            return total.at[evidence.slot].add((happened & evidence.is_searched).astype(total.dtype))
+            counts = evidence.is_searched & ~evidence.is_suspect
+            return total.at[evidence.slot].add((happened & counts).astype(total.dtype))
 
         state = Counts(
             count(state.searched, evidence.is_searched),

@@ -93,7 +93,9 @@ class VelocityGLR(AbstractDetector):
     """A χ²₃ value instead, the same in all frames; positive."""
     suspect: float | None = eqx.field(converter=number, default=None)
     """A smaller χ²₃ value above which a landmark is suspect: measured and tested, but corrected with no more until it
-    falls below; positive. None: every landmark is corrected with until it is flagged."""
+    falls below; positive and finite. The path is better for it, more static landmarks are flagged at one threshold,
+    and many after a jump of the odometry (docs/after_detection.md). Its derivative is zero, the decision being hard in
+    soft filters too. None: every landmark is corrected with until it is flagged."""
     velocity_std_m_s: float = eqx.field(converter=number, default=0.5)
     """σ of the weak prior on each component of the velocity, m/s; positive."""
     forgetting: float = eqx.field(converter=number, default=1.0)
@@ -112,7 +114,8 @@ class VelocityGLR(AbstractDetector):
         if self.threshold is not None:
             require(self, "threshold", lambda t: t > 0, "give a positive χ²₃ value (16.3 is 99.9 %), or None.")
         if self.suspect is not None:
-            require(self, "suspect", lambda t: t > 0, "give a positive χ²₃ value (7.8 is 95 %), or None.")
+            positive = "give a positive, finite χ²₃ value (7.8 is 95 %), or None."
+            require(self, "suspect", lambda t: (t > 0) & np.isfinite(t), positive)
             suspect, threshold = self.suspect, self.threshold
             is_told = threshold is not None and is_concrete(suspect) and is_concrete(threshold)
             if is_told and np.any(np.asarray(suspect) >= np.asarray(threshold)):

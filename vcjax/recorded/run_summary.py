@@ -10,7 +10,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.filter.info import FrameInfo
 from vcjax.gates.gate import AbstractJointGate
 from vcjax.recorded.filtered import Filtered
-from vcjax.recorded.verdicts import ACCEPTED, DELETED, DYNAMIC, RECOVERED, REJECTED, TrackVerdicts
+from vcjax.recorded.verdicts import ACCEPTED, DELETED, DYNAMIC, RECOVERED, REJECTED, SUSPECT, TrackVerdicts
 from vcjax.recording import Recording
 
 
@@ -28,14 +28,15 @@ def run_summary(
     `nis` is the mean normalised innovation squared of the accepted updates, z ᵀ Z⁻¹ z with 2 degrees of freedom. The
     gate cuts off what is not below t, its threshold, so in a consistent filter it has the mean and the variance of χ²₂
     below t; `nis_low` and `nis_high` hold 95 % of the means of as many independent ones. `beyond_gate` is the share of
-    measurements at or above the threshold, exp(-t/2) in a consistent filter of a static scene. A gate that accepts by
-    all innovations together cuts off otherwise: nothing is expected of it.
+    measurements at or above the threshold, suspect or not, exp(-t/2) in a consistent filter of a static scene. A gate
+    that accepts by all innovations together cuts off otherwise: nothing is expected of it.
 
     Source: Bar-Shalom, Li, Kirubarajan 2001, section 5.4, for the test.
     """
     info = filtered.info
-    accepted = np.asarray(info.is_accepted)
-    num_measured, num_accepted = int(np.sum(info.is_measured)), int(accepted.sum())
+    accepted, measured = np.asarray(info.is_accepted), np.asarray(info.is_measured)
+    num_measured, num_accepted = int(measured.sum()), int(accepted.sum())
+    is_within = accepted | (np.asarray(info.is_suspect) & np.asarray(config.gate.accepts(jnp.asarray(info.re1))))
     limit = float(config.gate.margin(jnp.zeros(())))
     mean, variance = nis_moments(limit)
     if isinstance(config.gate, AbstractJointGate):
@@ -56,13 +57,14 @@ def run_summary(
         "recovered": int(counts[RECOVERED]),
         "dynamic": int(counts[DYNAMIC]),
         "rejected": int(counts[REJECTED]),
+        "suspect": int(counts[SUSPECT]),
         "deleted": int(counts[DELETED]),
         "tracks_dynamic": int(np.sum(tracks.is_called)),
         "landmarks": len(filtered.landmarks.track_id),
         "nis": float(np.mean(np.asarray(info.re1)[accepted])) if num_accepted else math.nan,
         "nis_low": mean - half,
         "nis_high": mean + half,
-        "beyond_gate": 1.0 - num_accepted / num_measured if num_measured else math.nan,
+        "beyond_gate": float(np.mean(~is_within[measured])) if num_measured else math.nan,
         "beyond_gate_expected": math.exp(-limit / 2.0),
         "first_failure": failure,
         "failures": int(np.sum(~np.asarray(info.is_finite))),
@@ -107,7 +109,7 @@ def run_summary_text(found: dict[str, Any]) -> str:
             f"{found['dynamic']} verdicts of the gate, {found['deleted']} deletions by the detector, "
             f"of {found['tracks_dynamic']} tracks",
         ),
-        ("left out", f"{found['rejected']} rejected without a verdict"),
+        ("left out", f"{found['rejected']} rejected without a verdict, {found['suspect']} suspect to the detector"),
         ("landmarks", f"{found['landmarks']} mapped; the map was full in {found['frames_map_full']} frames"),
         (
             "mean NIS",

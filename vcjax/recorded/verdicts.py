@@ -8,10 +8,11 @@ from jaxtyping import Bool, Float, Int
 from vcjax.filter.info import FrameInfo
 from vcjax.sources.map_file import CLASSES
 
-VERDICTS = ("accepted", "recovered", "dynamic", "rejected", "deleted")
+VERDICTS = ("accepted", "recovered", "dynamic", "rejected", "suspect", "deleted")
 """Accepted: corrected with. Recovered: isolated, then corrected with. Dynamic: isolated, called dynamic by the gate and
-deleted. Rejected: isolated and left out. Deleted: by the detector, for what the frames before had shown."""
-ACCEPTED, RECOVERED, DYNAMIC, REJECTED, DELETED = range(5)
+deleted. Rejected: isolated and left out. Suspect: left out unjudged, since the detector suspects it. Deleted: by the
+detector, for what the frames before had shown."""
+ACCEPTED, RECOVERED, DYNAMIC, REJECTED, SUSPECT, DELETED = range(6)
 
 
 class Verdicts(NamedTuple):
@@ -26,7 +27,7 @@ class Verdicts(NamedTuple):
     re2: Float[np.ndarray, " N"]
     """RE₂ after the virtual correction; NaN where there was none."""
     margin: Float[np.ndarray, " N"]
-    """How dynamic it looked, in χ² units (see `FrameInfo.dynamic_margin`); NaN for "deleted"."""
+    """How dynamic it looked, in χ² units (see `FrameInfo.dynamic_margin`); NaN for "suspect" and "deleted"."""
     verdict: Int[np.ndarray, " N"]
     """Index into `VERDICTS`."""
 
@@ -36,10 +37,10 @@ class TrackVerdicts(NamedTuple):
 
     track_id: Int[np.ndarray, " L"]
     """Identities, growing."""
-    counts: Int[np.ndarray, "L 5"]
+    counts: Int[np.ndarray, "L 6"]
     """How often each of `VERDICTS` was passed."""
     margin: Float[np.ndarray, " L"]
-    """The largest of all frames: a score by which tracks can be ranked; NaN where never measured."""
+    """The largest of all frames: a score by which tracks can be ranked; NaN where never judged."""
     detector_margin: Float[np.ndarray, " L"]
     """The same of the detector's; NaN where it never had anything to say."""
 
@@ -56,8 +57,13 @@ def verdicts(info: FrameInfo) -> Verdicts:
         info: of every frame, leading axis T.
     """
     is_measured = np.asarray(info.is_measured)
-    flags = [np.asarray(flag)[is_measured] for flag in (info.is_accepted, info.is_recovered, info.is_dynamic)]
-    by_gate = np.select(flags, [ACCEPTED, RECOVERED, DYNAMIC], REJECTED)
+    told = {
+        ACCEPTED: info.is_accepted,
+        RECOVERED: info.is_recovered,
+        DYNAMIC: info.is_dynamic,
+        SUSPECT: info.is_suspect,
+    }
+    in_frame = np.select([np.asarray(flag)[is_measured] for flag in told.values()], list(told), REJECTED)
     numbers = [np.asarray(x, np.float64)[is_measured] for x in (info.re1, info.re2, info.dynamic_margin)]
     deleted = np.asarray(info.inconsistent_id)
     frame, slot = np.nonzero(deleted >= 0)
@@ -68,7 +74,7 @@ def verdicts(info: FrameInfo) -> Verdicts:
         frames,
         np.concatenate([np.asarray(info.candidate_id)[is_measured], deleted[frame, slot]]).astype(np.int64),
         *(np.concatenate([column, nothing]) for column in numbers),
-        np.concatenate([by_gate, np.full(len(frame), DELETED)]),
+        np.concatenate([in_frame, np.full(len(frame), DELETED)]),
     )
     return Verdicts(*(column[order] for column in columns))
 

@@ -31,6 +31,8 @@ _HEADER = (
     "position, cm",
     "against the static scene, cm",
     "ratio",
+    "orientation, deg",
+    "against the static scene, deg",
     "ANEES position",
     "ANEES pose",
     "ANEES map",
@@ -41,11 +43,11 @@ of all runs pooled, and how many: what was mapped for less counts here if it was
 flatters; *of all mapped*: of all movers ever in the map; *in a run*: how many unique movers, which needs no
 denominator; *static flagged*: static features ever flagged of those ever mapped; *delay*: frames from first birth to
 first deletion of the movers found; *velocity error*: |v̂ − v| of movers when they were flagged, of methods that estimate
-it, and in brackets its NEES / 3; *position*: RMS error of a run; *against the static scene*: the difference of it from
-the same seeds without movers, with its 95 % interval, bold where that excludes zero; *ratio*: of the two errors;
-*ANEES*: of position, pose and the places of the map's static landmarks, 1 of a consistent filter, bold outside the
-bounds in which 95 % of averages over so many runs lie. ± is a standard error over runs, which is 0 where all runs
-agree. The features that are flagged are those that gate or detector has ever deleted.
+it, and in brackets its NEES / 3; *position*, *orientation*: RMS error of a run; *against the static scene*: the
+difference of it from the same seeds without movers, with its 95 % interval, bold where that excludes zero; *ratio*: of
+the two errors of position; *ANEES*: of position, pose and the places of the map's static landmarks, 1 of a consistent
+filter, bold outside the bounds in which 95 % of averages over so many runs lie. ± is a standard error over runs, which
+is 0 where all runs agree. The features that are flagged are those that gate or detector has ever deleted.
 """
 
 
@@ -153,7 +155,7 @@ def _row(cell: Mapping[str, Any]) -> list[str]:
     found = _text(cell["found_fraction"], 1, 100)
     if cell["movers"]:
         found += f" ({cell['movers_found']} of {cell['movers']})"
-    difference = cell.get("difference", {}).get("position_rmse_cm")
+    position, orientation = (cell.get("difference", {}).get(name) for name in DIFFERENCES)
     return [
         cell["label"],
         cell["detector"],
@@ -164,8 +166,10 @@ def _row(cell: Mapping[str, Any]) -> list[str]:
         _text(cell["delay_frames"], 1),
         _velocity(cell),
         _text(cell["position_rmse_cm"], 2),
-        "–" if difference is None else _interval(difference),
-        "–" if difference is None else _text(cell["position_ratio"], 2),
+        "–" if position is None else _interval(position, 2),
+        "–" if position is None else _text(cell["position_ratio"], 2),
+        _text(cell["orientation_error_deg"], 3),
+        "–" if orientation is None else _interval(orientation, 3),
         *(_anees(cell, name) for name in DEGREES_OF_FREEDOM),
     ]
 
@@ -190,9 +194,13 @@ def _velocity(cell: Mapping[str, Any]) -> str:
     return f"{_text(cell['velocity_error_m_s'], 2)} ({cell['velocity_nees']['mean']:.2f})"
 
 
-def _interval(difference: Mapping[str, float]) -> str:
+def _interval(difference: Mapping[str, float], decimals: int) -> str:
     mean, lower, upper = (difference[part] for part in ("mean", "lower", "upper"))
     if not math.isfinite(lower):
-        return "–" if not math.isfinite(mean) else f"{mean:+.2f}".replace("-", "−")
-    text = f"{mean:+.2f} [{lower:+.2f}, {upper:+.2f}]".replace("-", "−")
+        return "–" if not math.isfinite(mean) else _signed(mean, decimals)
+    text = f"{_signed(mean, decimals)} [{_signed(lower, decimals)}, {_signed(upper, decimals)}]"
     return f"**{text}**" if lower > 0 or upper < 0 else text
+
+
+def _signed(value: float, decimals: int) -> str:
+    return f"{value:+.{decimals}f}".replace("-", "−")

@@ -15,18 +15,21 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from vcjax import extras
-from vcjax.recorded.verdicts import DYNAMIC, REJECTED, Verdicts
+from vcjax.recorded.verdicts import DELETED, DYNAMIC, Verdicts
 from vcjax.sources.image_sequence import read_image
 from vcjax.sources.map_file import CLASS_COLOURS
 from vcjax.sources.recording_file import RecordingFile
 from vcjax.sources.tracks import tracks_of
 from vcjax.storage import write_file
 
-STATUSES = ("accepted", "recovered", "dynamic", "rejected", "not used")
-"""What is told of a feature in a frame, the first four as in `verdicts.VERDICTS`; "not used": seen, and no more."""
+STATUSES = ("accepted", "recovered", "dynamic", "rejected", "suspect", "not used")
+"""What is told of a feature in a frame, the first five as in `verdicts.VERDICTS`; "not used": seen, and no more."""
 NOT_USED = len(STATUSES) - 1
 _NUM_GREYS = 250
-_COLOURS = [*(CLASS_COLOURS[name] for name in ("accepted", "recovered", "dynamic")), (86, 180, 233), (240, 228, 66)]
+_COLOURS = [
+    *(CLASS_COLOURS[name] for name in ("accepted", "recovered", "dynamic")),
+    *((86, 180, 233), (204, 121, 167), (240, 228, 66)),
+]
 _BLACK, _WHITE = 0, _NUM_GREYS - 1
 _LEGEND_PX = 26
 _MOST_PX = 8192
@@ -72,7 +75,7 @@ class FeaturePictures:
         self.unread: dict[int, str] = {}
         """What was wrong with the images that could not be read, by frame, of those that were drawn."""
         self._tracks, self._passed = tracks, passed
-        is_end = (passed.verdict == DYNAMIC) | (passed.verdict > REJECTED)
+        is_end = (passed.verdict == DYNAMIC) | (passed.verdict == DELETED)
         # First frame in which each track was called dynamic or deleted.
         self._ended = dict(zip(passed.track_id[is_end][::-1], passed.frame[is_end][::-1], strict=True))
 
@@ -187,14 +190,14 @@ def _save_video(pictures: Iterator[Any], path: Path, step_s: float) -> None:
 
 
 def _mark(draw: Any, place: np.ndarray, status: int, was_dynamic: bool) -> None:
-    """A feature: a ring, a disc where dynamic, a cross where rejected, a dot where not used."""
+    """A feature: a ring, a disc where dynamic, a cross where rejected or suspect, a dot where not used."""
     x, y = (float(p) for p in place)
     colour = _NUM_GREYS + status
     if STATUSES[status] == "not used":
         draw.ellipse((x - 2, y - 2, x + 2, y + 2), fill=colour, outline=_BLACK)
     elif STATUSES[status] == "dynamic":
         draw.ellipse((x - 7, y - 7, x + 7, y + 7), fill=colour, outline=_BLACK)
-    elif STATUSES[status] == "rejected":
+    elif STATUSES[status] in ("rejected", "suspect"):
         for width, ink in ((4, _BLACK), (2, colour)):
             draw.line((x - 5, y - 5, x + 5, y + 5), fill=ink, width=width)
             draw.line((x - 5, y + 5, x + 5, y - 5), fill=ink, width=width)
