@@ -29,8 +29,8 @@ def test_points_are_told_with_intervals_and_a_dash_where_nothing_was_flagged():
     ]
     text = curves_markdown(table)
     assert "| steady | RE | 4 | 10.00 [10.00, 10.00] | 50.0 [50.0, 50.0] | 37.5 [37.5, 37.5] |" in text
-    assert "| steady | RE | 9 | 0.00 [0.00, 0.00] | 0.0 [0.0, 0.0] | – |" in text
-    assert text.index("| A = 0.1 m | RE | 9 |") > text.index("| steady | RE+velocity_glr | 17 |")
+    assert "| steady | RE | **9** | 0.00 [0.00, 0.00] | 0.0 [0.0, 0.0] | – |" in text
+    assert text.index("| A = 0.1 m | RE | **9** |") > text.index("| steady | RE+velocity_glr | 17 |")
 
 
 def test_a_panel_for_each_amplitude_has_the_points_of_its_methods():
@@ -41,5 +41,10 @@ def test_a_panel_for_each_amplitude_has_the_points_of_its_methods():
     assert set(steady) == {"RE", "RE+velocity_glr"} and set(swinging) == {"RE"}
     np.testing.assert_allclose(steady["RE"], [[0.1, 0.5], [0, 0]])
     np.testing.assert_allclose(swinging["RE"], [[0.1, 1.0], [0.02, 0.5]])
+    rings = [[line.get_xydata() for line in axes.lines if line.get_markersize() == 10] for axes in roc.axes]
+    assert [len(each) for each in rings] == [2, 1]
+    np.testing.assert_allclose(rings[0][0], [[0, 0]])
+    np.testing.assert_allclose(rings[1][0], [[0.02, 0.5]])
+    assert rings[0][1].size == 0  # 24 was not run
     (points, _) = (container.lines[0].get_xydata() for container in precision.axes[0].containers)
     np.testing.assert_allclose(points, [[0.5, 3 / 8], [0, np.nan]])

@@ -10,12 +10,13 @@ from matplotlib.figure import Figure
 
 from vcjax.report.markup import grid
 from vcjax.report.style import METHOD_STYLES, RC, new_figure
+from vcjax.study.detection_methods import METHODS
 from vcjax.study.operating_curves import Curves, operating_point
 
 _INTRODUCTION = """\
 Each line is of runs at that threshold, all scenes with movers together but the harder ones: static features flagged of
 those ever mapped, movers found of those ever mapped, and movers among all that was flagged, with 95 % intervals by
-bootstrap over seeds.
+bootstrap over seeds. Bold: the method's own threshold.
 """
 _RESOLVED = 1e-3
 """Share of the static features above which the axis is logarithmic; below, down to none, it is linear."""
@@ -43,7 +44,7 @@ def curves_markdown(table: Sequence[Mapping[str, Any]]) -> str:
         [
             _camera(amplitude),
             line["detector"],
-            f"{point['threshold']:g}",
+            f"**{point['threshold']:g}**" if _is_own(line, point) else f"{point['threshold']:g}",
             _text(point["static_flagged_fraction"], 2),
             _text(point["found_of_mapped_fraction"], 1),
             _text(point["precision"], 1),
@@ -88,12 +89,20 @@ def _panels(table: Sequence[Mapping[str, Any]], across: str, up: str) -> tuple[F
             style = METHOD_STYLES[line["detector"]] | {"markersize": 4, "linewidth": 1.2, "label": line["detector"]}
             axes.fill_between(x[0], y[1], y[2], color=style["color"], alpha=0.15, linewidth=0)
             axes.errorbar(x[0], y[0], xerr=np.abs(x[1:] - x[0]), **style)
+            own = [_is_own(line, point) for point in line["points"]]
+            axes.plot(x[0][own], y[0][own], "o", color=style["color"], markersize=10, fillstyle="none")
         axes.set_ylim(0, 1.02)
         axes.set_title(_camera(amplitude))
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=min(3, len(names)))
-    figure.suptitle("All scenes with movers, a run for each threshold, 95 % intervals", fontsize=10)
+    figure.suptitle(
+        "All scenes with movers, each at several thresholds (ring: the method's own), 95 % intervals", fontsize=10
+    )
     return figure, panels
+
+
+def _is_own(line: Mapping[str, Any], point: Mapping[str, Any]) -> bool:
+    return point["threshold"] == METHODS[line["detector"]].threshold
 
 
 def _values(line: Mapping[str, Any], name: str) -> np.ndarray:
