@@ -39,13 +39,13 @@ class Study:
     """Runs of each scene at every point of the grid."""
     starts: int = 3
     """Descents."""
-    steps: int = 10
+    steps: int = 8
     """Steps of each."""
-    learning_rate: float = 0.4
+    learning_rate: float = 0.3
     """How far the first of them goes in the free numbers."""
     pairs: int = 4
     """Pairs of runs of each scene in a step."""
-    choosing_seeds: int = 40
+    choosing_seeds: int = 69
     """Runs of each scene by which the best descent is chosen."""
     held_out_seeds: int = 400
     """Runs of each scene on which the two are compared."""

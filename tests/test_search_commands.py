@@ -59,8 +59,8 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     # What is of other settings is refused before any work, as far as that can be known then.
     for changed, *words in (
         (["--learning-rate", "0.1"], "start_0.json", "other settings (schedule.", "give another directory"),
-        (["--choosing-seeds", "3"], "choice_of_3/candidates", "other settings (num_seeds: 2, now 3)"),
-        (["--held-out-seeds", "4"], "choice_of_3/held_out", "other settings (num_seeds: 3, now 4)"),
+        (["--choosing-seeds", "3"], "choice_of_2/candidates", "other settings (num_seeds: 2, now 3)"),
+        (["--held-out-seeds", "4"], "choice_of_2/held_out", "other settings (num_seeds: 3, now 4)"),
         (["--landscape-points", "4"], "landscape_thresholds", "another number of settings than"),
     ):
         assert main([*arguments, *changed]) == 1
@@ -149,7 +149,7 @@ def test_a_place_that_cannot_be_written_to_is_refused_before_any_work(command, p
     arguments = ["tune", "thresholds", *TUNE] if command == "tune" else ["sweep", *SWEEP]
     folder = tmp_path / "out" / "thresholds" if command == "tune" else tmp_path / "out"
     in_choice = command == "tune" and place in ("candidates", "held_out")
-    bad = folder / ("choice_of_4" if in_choice else "") / place.format(command)
+    bad = folder / ("choice_of_3" if in_choice else "") / place.format(command)
     bad.parent.mkdir(parents=True, exist_ok=True)
     bad.write_text("mine")
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 1

@@ -18,7 +18,7 @@ from vcjax.tuning.choice import ALL, COMPARED, RECALL, Choice, Seeds
 from vcjax.tuning.descent import Step
 from vcjax.tuning.landscape import as_grid
 from vcjax.tuning.losses import Objective
-from vcjax.tuning.tune import Tuned
+from vcjax.tuning.tune import End, Tuned
 
 TH1, TH2 = "config.gate.th1", "config.gate.th2"
 SCENES = ["lateral, 1 m/s", "inverse forward, 1 m/s"]
@@ -200,26 +200,31 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     points.loss[1, 0, 2] = np.nan
     choice = choice._replace(candidates=points)
     origin = {"vcjax": "1", "parameters": {TH1: "between"}}
-    tuned = Tuned([steps, steps], choice, 64, origin, left_out)
+    settings = [{path: float(points[path][i]) for path in (TH1, TH2)} for i in (1, 2)]
+    ends = [End(settings[0], 0.25, True), End({TH1: 5.0, TH2: 6.0}, 0.5, False), End(settings[1], 0.375, True)]
+    tuned = Tuned([steps] * 3, ends, choice, 96, origin, left_out)
     paths = write_tuning(tuned, {"thresholds": grid}, tmp_path / "tune")
-    told = "1 of 3 starts were left out, 2 of 8 steps were not taken, 14 of 32 pairs of runs were left out of steps"
+    told = "1 of 4 starts were left out, 3 of 12 steps were not taken, 21 of 48 pairs of runs were left out of steps"
     assert told in (tmp_path / "tune" / "tune.md").read_text()
     content = json.loads((tmp_path / "tune" / "tune.json").read_text())
     assert content["before"]["parameters"] == choice.before and content["after"]["parameters"] == choice.after
     assert content["history"][1][2]["parameters"] == {TH1: 11.0, TH2: 7.0}
-    assert content["history"][0][3]["loss"] is None and (content["steps_skipped"], content["pairs_failed"]) == (2, 14)
+    assert content["history"][0][3]["loss"] is None and (content["steps_skipped"], content["pairs_failed"]) == (3, 21)
     assert content["starts_left_out"] == left_out
     assert content["wanted"] == describe(Objective(position=2.0))
     assert content["origin"] == {"vcjax": "1", "seeds": describe(Seeds(3, 30)), "parameters": {TH1: "between"}}
-    before, failed, after = content["candidates"]
+    before, failed, unasked, after = content["candidates"]
     assert before["parameters"] == choice.before and after["parameters"] == choice.after
-    assert failed == {"parameters": {TH1: 8.0, TH2: 3.0}, "loss": {"mean": None, "se": None}}
+    nothing = {"mean": None, "se": None}
+    assert failed == {"parameters": {TH1: 8.0, TH2: 3.0}, "smoothed_loss": 0.25, "is_judged": True, "loss": nothing}
+    assert unasked == {"parameters": {TH1: 5.0, TH2: 6.0}, "smoothed_loss": 0.5, "is_judged": False, "loss": nothing}
+    assert before["smoothed_loss"] is None and before["is_judged"] and after["smoothed_loss"] == 0.375
     losses = points.loss[2].mean("scene")
     assert after["loss"] == {"mean": pytest.approx(float(losses.mean())), "se": pytest.approx(stats.sem(losses))}
     text = (tmp_path / "tune" / "tune.md").read_text()
     assert "Wanted, by weight: `track_f1` 1, `position` 2.\n" in text
-    assert "| end of descent 1 | 8 | 3 | – |" in text
-    chosen = f"| **end of descent 2** | 16 | 27 | {after['loss']['mean']:.4f} ± {after['loss']['se']:.4f} |"
+    assert "| end of descent 1 | 8 | 3 | 0.2500 | – |" in text and "| end of descent 2 | 5 | 6 | 0.5000 | – |" in text
+    chosen = f"| **end of descent 3** | 16 | 27 | 0.3750 | {after['loss']['mean']:.4f} ± {after['loss']['se']:.4f} |"
     assert chosen in text and "| before | 9 | 9 | " in text and "3 seeds of each scene" in text
     assert {"before", "after", "history", "paired"} <= set(content)
     figures = {path.name for path in paths if path.suffix == ".png"}

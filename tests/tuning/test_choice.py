@@ -190,7 +190,13 @@ def test_tuning_descends_from_each_start_chooses_and_goes_on_where_it_stopped(tm
     # Another start is one more descent: those that there are stay, and are among the candidates again.
     more = tuned(tmp_path, num_starts=3)
     assert len(steps) == 1 + 2 and more.descents[:2] == whole.descents
-    assert more.choice.candidates.sizes["setting"] == 4
+    # Of three ends the two are judged whose descents ended with the smaller smoothed loss.
+    losses = [end.smoothed_loss for end in more.ends]
+    assert [end.smoothed_loss for end in whole.ends] == losses[:2]
+    assert losses == [pytest.approx(steps[-1].loss) for steps in more.descents]
+    assert [end.is_judged for end in more.ends] == [loss < max(losses) for loss in losses]
+    judged = [end.setting for end in more.ends if end.is_judged]
+    np.testing.assert_allclose(more.choice.candidates[TH1][1:], [setting[TH1] for setting in judged], rtol=1e-12)
     assert tuned(tmp_path).choice.after == whole.choice.after and len(steps) == 3
 
     with pytest.raises(ValueError, match=r"start_0\.json has other settings \(schedule\..*; give another directory"):
@@ -246,6 +252,7 @@ def test_a_later_start_where_the_objective_is_not_finite_is_left_out_and_told(tm
     whole = tuned(**given)
     assert len(begun) == 3 and len(whole.descents) == 2 and whole.left_out == [begun[1]]
     assert whole.choice.candidates.sizes["setting"] == 3  # before, and two ends
+    assert np.isnan(whole.ends[0].smoothed_loss) and all(end.is_judged for end in whole.ends)
     assert (whole.num_steps, whole.num_skipped, whole.num_failed) == (4, 2, 6)
     # JSON has no NaN: there are nulls, which are read back as what they were; and the start is not tried again.
     kept = (tmp_path / "descents" / "start_0.json").read_text()

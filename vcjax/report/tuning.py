@@ -19,7 +19,7 @@ from vcjax.study.summary import mean_and_error
 from vcjax.tuning.choice import Choice, Setting
 from vcjax.tuning.landscape import as_grid, means
 from vcjax.tuning.losses import SHAPES
-from vcjax.tuning.tune import Tuned
+from vcjax.tuning.tune import End, Tuned
 
 
 def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: Path) -> list[Path]:
@@ -28,7 +28,8 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     `tune.json` is a `comparison` with the `history` of every descent, each step with its parameters, temperature,
     smoothed loss and gradient; how many runs there were, and starts, steps and pairs of runs that were left out; what
     was `wanted`, the weights of the objective; the `origin` of it all; and the `candidates`, setting before and ends of
-    the descents, each with its mean `loss` on the seeds that chose.
+    the descents, each with the `smoothed_loss` at the end of its descent and its mean `loss` on the seeds that chose,
+    null where that was not asked (`is_judged`).
 
     Args:
         tuned: the tuning.
@@ -47,7 +48,7 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
         "steps_skipped": tuned.num_skipped,
         "pairs_failed": tuned.num_failed,
         "starts_left_out": [dict(start) for start in tuned.left_out],
-        "candidates": _candidates(tuned.choice),
+        "candidates": _candidates(tuned),
     }
     title = f"# Tuned by gradient\n\n{_runs(compared)} {_left_out(tuned)}\n{_weights(compared)}\n{_costs(compared)}"
     paths = _write(compared, title, directory / "tune")
@@ -146,17 +147,19 @@ def _weights(compared: Mapping[str, Any]) -> str:
     return f"Wanted, by weight: {', '.join(f'`{name}` {value:g}' for name, value in weights.items())}.\n"
 
 
-def _candidates(choice: Choice) -> list[dict[str, Any]]:
-    """Each with the mean over scenes and seeds that chose, NaN where a run failed, and its standard error."""
-    loss = choice.candidates.loss.mean("scene", skipna=False)
+def _candidates(tuned: Tuned) -> list[dict[str, Any]]:
+    """Each with the mean over scenes and seeds that chose, NaN where a run failed or none was made, and its error."""
+    loss = tuned.choice.candidates.loss.mean("scene", skipna=False)
     mean, error = mean_and_error(loss, xr.ones_like(loss, bool))
-    parameters = {path: choice.candidates[path].values.tolist() for path in choice.before}
+    costs = iter(zip(mean.values.tolist(), error.values.tolist(), strict=True))
     return [
         {
-            "parameters": {path: values[i] for path, values in parameters.items()},
-            "loss": {"mean": float(mean[i]), "se": float(error[i])},
+            "parameters": dict(end.setting),
+            "smoothed_loss": end.smoothed_loss,
+            "is_judged": end.is_judged,
+            "loss": dict(zip(("mean", "se"), next(costs) if end.is_judged else (math.nan, math.nan), strict=True)),
         }
-        for i in range(loss.sizes["setting"])
+        for end in (End(tuned.choice.before, math.nan, True), *tuned.ends)
     ]
 
 
@@ -169,10 +172,17 @@ def _costs(compared: Mapping[str, Any]) -> str:
         name = f"**{name}**" if values == compared["after"]["parameters"] else name
         spread = f" ± {error:.4f}" if math.isfinite(error) else ""
         cost = f"{mean:.4f}{spread}" if math.isfinite(mean) else "–"
-        rows.append([name, *(f"{value:.4g}" for value in values.values()), cost])
+        smoothed = candidate["smoothed_loss"]
+        smoothed = f"{smoothed:.4f}" if math.isfinite(smoothed) else "–"
+        rows.append([name, *(f"{value:.4g}" for value in values.values()), smoothed, cost])
     seeds = compared["origin"]["seeds"]["choosing"]
-    header = ["candidate", *(f"`{path}`" for path in compared["before"]["parameters"]), "loss ± standard error"]
-    return f"Candidates on the {seeds} seeds of each scene that chose; bold the chosen one.\n\n{table(header, rows)}"
+    parameters = (f"`{path}`" for path in compared["before"]["parameters"])
+    header = ["candidate", *parameters, "smoothed loss", "loss ± standard error"]
+    told = (
+        f"Candidates: the smoothed loss in the last quarter of their descents, of which the better half is judged, and "
+        f"the loss on the {seeds} seeds of each scene that chose; bold the chosen one."
+    )
+    return f"{told}\n\n{table(header, rows)}"
 
 
 def _left_out(tuned: Tuned) -> str:

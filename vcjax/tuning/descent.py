@@ -167,7 +167,16 @@ def end_of(problem: Problem, schedule: Schedule, history: Sequence[Step]) -> dic
     for step in history:
         free, state = _move(optimiser, free, state, step)
         places.append(free)
-    return problem.to_parameters(np.mean(places[-max(1, len(history) // 4) :], axis=0))
+    return problem.to_parameters(np.mean(_last_quarter(places), axis=0))
+
+
+def last_loss(history: Sequence[Step]) -> float:
+    """Mean of the smoothed objective over the last quarter of the steps; NaN where one of them has none."""
+    return float(np.mean(_last_quarter([step.loss for step in history])))
+
+
+def _last_quarter(values: list) -> list:
+    return values[-max(1, len(values) // 4) :]
 
 
 def _move(optimiser: optax.GradientTransformation, free: np.ndarray, state: Any, step: Step) -> tuple[np.ndarray, Any]:

@@ -23,7 +23,7 @@ from vcjax.storage import check_writable, with_nulls, write_json
 from vcjax.study.results import describe, import_xarray, provenance, refuse_other_settings
 from vcjax.tuning.blocks import as_directory
 from vcjax.tuning.choice import Choice, Seeds, Setting, check_directory, choose, setting_of
-from vcjax.tuning.descent import NotFinite, Schedule, Step, descend, end_of
+from vcjax.tuning.descent import NotFinite, Schedule, Step, descend, end_of, last_loss
 from vcjax.tuning.intervals import Interval
 from vcjax.tuning.losses import Objective
 from vcjax.tuning.problem import Problem, problem_of
@@ -32,13 +32,25 @@ _MARGIN = 0.1
 """How near to the ends of their intervals starts are drawn, as a part of these."""
 
 
+class End(NamedTuple):
+    """Where a descent has led."""
+
+    setting: Setting
+    smoothed_loss: float
+    """Mean of the smoothed objective over the last quarter of its steps."""
+    is_judged: bool
+    """Whether it is a candidate of the choice."""
+
+
 class Tuned(NamedTuple):
     """What tuning gave."""
 
     descents: list[list[Step]]
     """Every step from every start that was not left out; the first is where the parameters were."""
+    ends: list[End]
+    """Where each of them has led."""
     choice: Choice
-    """Where they were, the best end of a descent, and what it is worth."""
+    """Where the parameters were, the best end of a descent, and what it is worth."""
     num_runs: int
     """Runs in the descents, each with its derivative."""
     origin: Mapping[str, Any]
@@ -86,7 +98,8 @@ def tune(
         schedule: steps, seeds and temperatures of each descent.
         num_starts: descents; the first from where the parameters are, the others from points spread over the intervals
             (a Halton sequence), since an objective may have several valleys. One of the others where the objective is
-            not finite is left out.
+            not finite is left out. Of more than two, the better half of the ends, by the smoothed loss of their
+            descents, is judged by hard decisions: so a choice costs less, and may have more seeds.
         seeds: to choose the best end of a descent, and to compare it with the start.
         key: base key.
         directory: where the work is kept, and looked for.
@@ -111,10 +124,10 @@ def tune(
     descent_key, choice_key = jax.random.split(key)
     kept = [_KeptSteps(directory, number, origin, start) for number, start in enumerate(starts)]
     before = [each.read() for each in kept]
-    num_candidates = 1 + sum(history is not None for history in before)
+    num_begun = sum(history is not None for history in before)
     given = {"objective": problem.objective, "seeds": seeds, "key": choice_key}
     if directory is not None:
-        check_directory(_choice_of(directory, num_candidates), scenarios, config, num_candidates, **given)
+        check_directory(_choice_of(directory, num_begun), scenarios, config, 1 + _num_judged(num_begun), **given)
     descents, left_out = [], []
     for number, (start, history) in enumerate(zip(starts, before, strict=True)):
 
@@ -135,16 +148,30 @@ def tune(
                     raise
             kept[number].write(None)
         left_out.append(start)
-    candidates = [starts[0], *(end_of(problem, schedule, steps) for steps in descents)]
-    place = None if directory is None else _choice_of(directory, len(candidates))
+    ends = _ends(problem, schedule, descents)
+    candidates = [starts[0], *(end.setting for end in ends if end.is_judged)]
+    place = None if directory is None else _choice_of(directory, len(descents))
     choice = choose(scenarios, config, candidates, directory=place, progress=progress, **given)
     runs_per_step = 2 * schedule.pairs_per_step * len(scenarios)
-    return Tuned(descents, choice, runs_per_step * (sum(map(len, descents)) + len(left_out)), origin, left_out)
+    return Tuned(descents, ends, choice, runs_per_step * (sum(map(len, descents)) + len(left_out)), origin, left_out)
 
 
-def _choice_of(directory: Path, num_candidates: int) -> Path:
+def _ends(problem: Problem, schedule: Schedule, descents: Sequence[list[Step]]) -> list[End]:
+    losses = [last_loss(steps) for steps in descents]
+    judged = np.argsort(losses, kind="stable")[: _num_judged(len(descents))]  # NaN comes last
+    return [
+        End(end_of(problem, schedule, steps), loss, number in judged)
+        for number, (steps, loss) in enumerate(zip(descents, losses, strict=True))
+    ]
+
+
+def _num_judged(num_descents: int) -> int:
+    return min(num_descents, max(2, -(-num_descents // 2)))
+
+
+def _choice_of(directory: Path, num_descents: int) -> Path:
     """Where a choice is kept: another for more starts, so that these go on from the descents that there are."""
-    return directory / f"choice_of_{num_candidates}"
+    return directory / f"choice_of_{num_descents}"
 
 
 def _starts(problem: Problem, before: dict[str, float], num: int) -> list[dict[str, float]]:
