@@ -158,6 +158,17 @@ def test_a_place_that_cannot_be_written_to_is_refused_before_any_work(command, p
     assert bad.read_text() == "mine"
 
 
+def test_more_starts_extend_a_tuning_whose_landscapes_depend_on_the_choice(tmp_path, capsys):
+    """A price of motion that only another start can pay: the other two numbers of each landscape change with it."""
+    arguments = ["tune", "joint", *TUNE, "--camera-motion", "50", "--out", str(tmp_path), "--starts"]
+    tuned = []
+    for starts in ("1", "3"):
+        assert main([*arguments, starts]) == 0, said(capsys)[1]
+        tuned.append(json.loads((tmp_path / "joint" / "tune.json").read_text()))
+    assert [len(each["history"]) for each in tuned] == [1, 3]
+    assert tuned[0]["after"]["parameters"] != tuned[1]["after"]["parameters"]
+
+
 def test_scenes_are_every_motion_at_every_speed(unchecked):
     scenes = Scenes(speeds_m_s=(1.0, 0.5), amplitude_m=0.02, frequency_hz=2.0).make()
     assert list(scenes) == [f"{motion}, {v} m/s" for motion in ("lateral", "inverse forward") for v in ("1", "0.5")]

@@ -68,6 +68,18 @@ def test_counts_and_flags_are_the_plain_ones(seed, numbers):
     np.testing.assert_array_equal(flags, expected)
 
 
+def test_a_suspect_that_is_missed_in_some_frames_is_not_flagged_for_it():
+    detector, found = InlierRatio(), np.arange(60) % 6 > 0
+    state = born(detector, 1)
+    for is_found in found:
+        frame = evidence(
+            [0], 1, is_measured=np.array([is_found]), is_corrected=np.array([False]), is_suspect=np.array([True])
+        )
+        state, margin = detector.observe(state, frame)
+        assert not margin[0] > 0
+    assert state == Counts(1.0, 1.0, 1.0)
+
+
 def test_both_ratios_and_only_they_flag():
     def is_anything_flagged(*ratios):
         return bool(np.any(counts_and_flags(InlierRatio(5, *ratios), random_evidence(3))[1]))

@@ -152,7 +152,10 @@ def test_figures_of_one_scene_have_their_titles_whole(choice):
 def test_figures_tell_what_they_cannot_show(choice, tmp_path, monkeypatch):
     """Curves without movers; and a best point where nothing is better than before."""
     static = choice.held_out.assign(track_score=choice.held_out.track_score.where(~choice.held_out.is_moving))
-    for held_out, expected in ((static, ["no mover was measured"]), (choice.held_out, [])):
+    for held_out, expected in (
+        (static, [f"{side}: no mover was measured" for side in ("before", "after")]),
+        (choice.held_out, []),
+    ):
         figure = curves_figure(choice._replace(held_out=held_out))
         assert [[text.get_text() for text in axes.texts] for axes in figure.axes] == [expected, expected]
     marks = []
@@ -201,7 +204,8 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     choice = choice._replace(candidates=points)
     origin = {"vcjax": "1", "parameters": {TH1: "between"}}
     settings = [{path: float(points[path][i]) for path in (TH1, TH2)} for i in (1, 2)]
-    ends = [End(settings[0], 0.25, True), End({TH1: 5.0, TH2: 6.0}, 0.5, False), End(settings[1], 0.375, True)]
+    other = {TH1: 5.0, TH2: 6.0}
+    ends = [End(settings[0], 0.25, 0.01, True), End(other, 0.5, 0.02, False), End(settings[1], 0.375, np.nan, True)]
     tuned = Tuned([steps] * 3, ends, choice, 96, origin, left_out)
     paths = write_tuning(tuned, {"thresholds": grid}, tmp_path / "tune")
     told = "1 of 4 starts were left out, 3 of 12 steps were not taken, 21 of 48 pairs of runs were left out of steps"
@@ -216,14 +220,18 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     before, failed, unasked, after = content["candidates"]
     assert before["parameters"] == choice.before and after["parameters"] == choice.after
     nothing = {"mean": None, "se": None}
-    assert failed == {"parameters": {TH1: 8.0, TH2: 3.0}, "smoothed_loss": 0.25, "is_judged": True, "loss": nothing}
-    assert unasked == {"parameters": {TH1: 5.0, TH2: 6.0}, "smoothed_loss": 0.5, "is_judged": False, "loss": nothing}
-    assert before["smoothed_loss"] is None and before["is_judged"] and after["smoothed_loss"] == 0.375
+    for candidate, end in ((failed, ends[0]), (unasked, ends[1])):
+        smoothed = {"mean": end.smoothed_loss, "se": end.smoothed_se}
+        expected = {"parameters": end.setting, "smoothed_loss": smoothed, "is_judged": end.is_judged, "loss": nothing}
+        assert candidate == expected
+    assert before["smoothed_loss"] == nothing and before["is_judged"]
+    assert after["smoothed_loss"] == {"mean": 0.375, "se": None}
     losses = points.loss[2].mean("scene")
     assert after["loss"] == {"mean": pytest.approx(float(losses.mean())), "se": pytest.approx(stats.sem(losses))}
     text = (tmp_path / "tune" / "tune.md").read_text()
     assert "Wanted, by weight: `track_f1` 1, `position` 2.\n" in text
-    assert "| end of descent 1 | 8 | 3 | 0.2500 | – |" in text and "| end of descent 2 | 5 | 6 | 0.5000 | – |" in text
+    assert "| end of descent 1 | 8 | 3 | 0.2500 ± 0.0100 | – |" in text
+    assert "| end of descent 2 | 5 | 6 | 0.5000 ± 0.0200 | – |" in text and "of the 2 ends whose smoothed loss" in text
     chosen = f"| **end of descent 3** | 16 | 27 | 0.3750 | {after['loss']['mean']:.4f} ± {after['loss']['se']:.4f} |"
     assert chosen in text and "| before | 9 | 9 | " in text and "3 seeds of each scene" in text
     assert {"before", "after", "history", "paired"} <= set(content)

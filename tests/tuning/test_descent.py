@@ -129,6 +129,10 @@ def test_steps_draw_new_seeds_the_temperature_falls_and_a_stopped_descent_goes_o
     assert len({step.loss for step in steps}) == 3
     assert descend(PROBLEM, START, schedule, key=KEY, history=steps[:2]) == steps
     assert descend(PROBLEM, START, schedule, key=KEY, history=steps) == steps
+    # Steps of another rule would be continued from where they never were.
+    elsewhere = [steps[0], steps[1]._replace(parameters=steps[2].parameters)]
+    with pytest.raises(ValueError, match=r"step 1 was taken at .* lead to .*another version; begin anew"):
+        descend(PROBLEM, START, schedule, key=KEY, history=elsewhere)
     # The end is where the last step led, which is where the next one would have been taken.
     assert end_of(PROBLEM, schedule, steps[:2]) == pytest.approx(steps[2].parameters, rel=1e-9)
     assert end_of(PROBLEM, schedule, steps) != pytest.approx(steps[2].parameters, rel=1e-9)

@@ -20,7 +20,7 @@ from vcjax.tuning.landscape import around
 from vcjax.tuning.losses import WANTED, Objective
 from vcjax.tuning.problem import MAX_AMPLITUDE_M
 from vcjax.tuning.scenes import Scenes
-from vcjax.tuning.tune import tune
+from vcjax.tuning.tune import choice_of, tune
 
 What = Literal["thresholds", "oscillation", "joint"]
 _LANDSCAPE_SEEDS = 4
@@ -82,7 +82,8 @@ class Tune:
         for name in chosen if self.landscape_points else ():
             given = {"objective": self.objective, "num_seeds": _LANDSCAPE_SEEDS, "key": key}
             num_settings = self.landscape_points**2
-            check_blocks(directory / f"landscape_{name}", scenarios, config, None, num_settings, **given)
+            place = _landscape_in(choice_of(directory, self.starts), name)
+            check_blocks(place, scenarios, config, None, num_settings, **given)
         with progress_bar(console, "compiling, first step") as show:
             tuned = tune(
                 scenarios,
@@ -106,7 +107,7 @@ class Tune:
                     num_points=self.landscape_points,
                     num_seeds=_LANDSCAPE_SEEDS,
                     key=key,
-                    directory=directory / f"landscape_{name}",
+                    directory=_landscape_in(choice_of(directory, len(tuned.descents)), name),
                     progress=lambda done, total, name=name: show(done, total, f"landscape of {name}"),
                 )
                 for name, pair in chosen.items()
@@ -159,6 +160,11 @@ class Tune:
         _require_inside("--amplitude-m", self.scenes.amplitude_m, amplitude, "--max-amplitude-m")
         _require_inside("--frequency-hz", self.scenes.frequency_hz, frequency, "--frequency-band-hz")
         return {path_A: amplitude, path_f: frequency}
+
+
+def _landscape_in(choice: Path, name: str) -> Path:
+    """Where a landscape is kept: with the choice, on which its other numbers depend."""
+    return choice / f"landscape_{name}"
 
 
 def _require_inside(option: str, value: float, interval: Interval, bounds: str | None = None) -> None:

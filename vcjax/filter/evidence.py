@@ -11,6 +11,7 @@ def evidence_of(
     slot: Int[Array, " K"],
     is_searched: Bool[Array, " K"],
     is_measured: Bool[Array, " K"],
+    is_suspect: Bool[Array, " K"],
     is_visible: Bool[Array, " L"],
     pixel_cov: Float[Array, "2 2"],
     time_step_s: Float[Array, ""],
@@ -22,6 +23,7 @@ def evidence_of(
         slot: of each candidate.
         is_searched: which candidates there are.
         is_measured: which of them were found in the image.
+        is_suspect: which of them the detector suspects, found or not.
         is_visible: which slots' landmarks lie inside the image and stay in the map.
         pixel_cov: R of a measured pixel, px².
         time_step_s: since the frame before.
@@ -32,7 +34,7 @@ def evidence_of(
         is_searched=is_searched,
         is_measured=is_measured,
         is_corrected=outcome.is_accepted | outcome.is_recovered,
-        is_suspect=outcome.is_suspect,
+        is_suspect=is_suspect,
         weight=outcome.weight,
         innovation=innovation.z,
         innovation_cov=innovation.S,

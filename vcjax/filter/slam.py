@@ -94,7 +94,7 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     detector = _of_mapped(config, state)
     suspicion = config.detector.suspicion(detector)
     state, submap, rows = gather(config, state, slot)
-    is_suspect = None if suspicion is None else suspicion[slot] > 0
+    is_suspect = jnp.zeros_like(is_searched) if suspicion is None else is_searched & (suspicion[slot] > 0)
     submap, outcome = correct_frame(config, frame.camera, submap, uv_px, is_measured, is_suspect)
     state = scatter(config, state, submap, slot, rows)
     innovation, verdict = outcome.innovation, outcome.verdict
@@ -105,7 +105,8 @@ def step(config: FilterConfig, state: FilterState, frame: Frame) -> tuple[Filter
     )
     is_watched = state.is_mapped & ~is_dynamic
     R = pixel_cov(config, innovation.S.dtype)
-    evidence = evidence_of(outcome, slot, is_searched, is_measured, is_visible & ~is_dynamic, R, frame.time_step_s)
+    is_visible &= ~is_dynamic
+    evidence = evidence_of(outcome, slot, is_searched, is_measured, is_suspect, is_visible, R, frame.time_step_s)
     detector, margin = config.detector.observe(detector, evidence)
     margin = jnp.where(is_watched, margin, jnp.nan).astype(state.P_vv.dtype)
     is_flagged = margin > 0

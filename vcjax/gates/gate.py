@@ -158,7 +158,7 @@ class Evidence(eqx.Module):
     is_corrected: Bool[Array, " K"]
     """Used in a formal correction, accepted or recovered."""
     is_suspect: Bool[Array, " K"]
-    """Found, and neither corrected with nor judged by the gate, since a detector suspects it."""
+    """Suspected by a detector: found or not, it is neither corrected with nor judged by the gate."""
     weight: Float[Array, " K"]
     """To what degree it was used, in [0, 1]: 0 or 1 unless the filter is soft (see `surrogates`)."""
     innovation: Float[Array, "K 2"]

@@ -63,8 +63,8 @@ def draw_curve(axes: Axes, levels: np.ndarray, curve, tracks: roc.Tracks, label:
     """`roc.recall_at` or `precision_at` with its pointwise 95 % band by bootstrap over seeds; a word where none is."""
     if np.all(np.isnan(curve(tracks, levels)[0])):
         axes.plot([], [], label=label, **style)
-        if not axes.texts:
-            axes.text(0.5, 0.5, "no mover was measured", transform=axes.transAxes, ha="center")
+        height = 0.5 - 0.1 * len(axes.texts)
+        axes.text(0.5, height, f"{label}: no mover was measured", transform=axes.transAxes, ha="center")
         return
     low, high = roc.interval(roc.resampled(curve, tracks, levels, _RESAMPLES))
     axes.plot(levels, curve(tracks, levels)[0], label=label, **style)

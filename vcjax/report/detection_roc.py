@@ -90,7 +90,7 @@ def _panels(table: Sequence[Mapping[str, Any]], across: str, up: str) -> tuple[F
             axes.fill_between(x[0], y[1], y[2], color=style["color"], alpha=0.15, linewidth=0)
             axes.errorbar(x[0], y[0], xerr=np.abs(x[1:] - x[0]), **style)
             own = [_is_own(line, point) for point in line["points"]]
-            axes.plot(x[0][own], y[0][own], "o", color=style["color"], markersize=10, fillstyle="none")
+            axes.plot(x[0][own], y[0][own], "o", color=style["color"], markersize=10, fillstyle="none", clip_on=False)
         axes.set_ylim(0, 1.02)
         axes.set_title(_camera(amplitude))
     handles, names = panels[0].get_legend_handles_labels()

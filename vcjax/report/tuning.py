@@ -28,8 +28,8 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     `tune.json` is a `comparison` with the `history` of every descent, each step with its parameters, temperature,
     smoothed loss and gradient; how many runs there were, and starts, steps and pairs of runs that were left out; what
     was `wanted`, the weights of the objective; the `origin` of it all; and the `candidates`, setting before and ends of
-    the descents, each with the `smoothed_loss` at the end of its descent and its mean `loss` on the seeds that chose,
-    null where that was not asked (`is_judged`).
+    the descents, each with the `smoothed_loss` in the last quarter of its descent and its `loss` on the seeds that
+    chose, mean and standard error, null where that was not asked (`is_judged`).
 
     Args:
         tuned: the tuning.
@@ -155,34 +155,36 @@ def _candidates(tuned: Tuned) -> list[dict[str, Any]]:
     return [
         {
             "parameters": dict(end.setting),
-            "smoothed_loss": end.smoothed_loss,
+            "smoothed_loss": {"mean": end.smoothed_loss, "se": end.smoothed_se},
             "is_judged": end.is_judged,
             "loss": dict(zip(("mean", "se"), next(costs) if end.is_judged else (math.nan, math.nan), strict=True)),
         }
-        for end in (End(tuned.choice.before, math.nan, True), *tuned.ends)
+        for end in (End(tuned.choice.before, math.nan, math.nan, True), *tuned.ends)
     ]
 
 
 def _costs(compared: Mapping[str, Any]) -> str:
     """The candidates as a table; bold what was chosen."""
-    rows = []
+    rows, ends = [], compared["candidates"][1:]
     for number, candidate in enumerate(compared["candidates"]):
-        (mean, error), values = candidate["loss"].values(), candidate["parameters"]
+        values = candidate["parameters"]
         name = f"end of descent {number}" if number else "before"
         name = f"**{name}**" if values == compared["after"]["parameters"] else name
-        spread = f" ± {error:.4f}" if math.isfinite(error) else ""
-        cost = f"{mean:.4f}{spread}" if math.isfinite(mean) else "–"
-        smoothed = candidate["smoothed_loss"]
-        smoothed = f"{smoothed:.4f}" if math.isfinite(smoothed) else "–"
-        rows.append([name, *(f"{value:.4g}" for value in values.values()), smoothed, cost])
+        costs = (_with_error(candidate[each]) for each in ("smoothed_loss", "loss"))
+        rows.append([name, *(f"{value:.4g}" for value in values.values()), *costs])
     seeds = compared["origin"]["seeds"]["choosing"]
+    told = f"Candidates, and their loss on the {seeds} seeds of each scene that chose, ± standard error"
+    if (num_judged := sum(end["is_judged"] for end in ends)) < len(ends):
+        told += f", of the {num_judged} ends whose smoothed loss in the last quarter of the descent is the smallest"
     parameters = (f"`{path}`" for path in compared["before"]["parameters"])
-    header = ["candidate", *parameters, "smoothed loss", "loss ± standard error"]
-    told = (
-        f"Candidates: the smoothed loss in the last quarter of their descents, of which the better half is judged, and "
-        f"the loss on the {seeds} seeds of each scene that chose; bold the chosen one."
-    )
-    return f"{told}\n\n{table(header, rows)}"
+    return f"{told}; bold the chosen one.\n\n{table(['candidate', *parameters, 'smoothed loss', 'loss'], rows)}"
+
+
+def _with_error(cost: Mapping[str, float]) -> str:
+    mean, error = cost["mean"], cost["se"]
+    if not math.isfinite(mean):
+        return "–"
+    return f"{mean:.4f} ± {error:.4f}" if math.isfinite(error) else f"{mean:.4f}"
 
 
 def _left_out(tuned: Tuned) -> str:

@@ -4,10 +4,11 @@ Each parameter lives in an interval and is moved as a free number x (see `interv
 its gradient over a mini-batch of seeds, new in every step, and over all scenes. What is followed is the gradient in
 units of its standard errors, (∂L/∂xᵢ)/sᵢ: not how much a parameter matters, but how sure it is which way it has to go,
 so that one whose gradient is mostly noise neither hides the others nor is moved far. A step is as long as the learning
-rate where this is sure, and shorter where it drowns in noise: its norm counts up to √2 errors in each parameter. (Units
-that an optimiser learns from earlier gradients are those of the first, steep ones, and too large where it has to
-settle; Adam's, one for each parameter, move one of which nothing is known by its noise as far as the others.) The
-temperature of the smoothing falls from step to step.
+rate where this is sure, and shorter where it is less so: its norm counts up to √2 errors in each parameter, so that
+one of nothing but noise moves by about 0.6 of the learning rate, in no direction in particular. (Units that an
+optimiser learns from earlier gradients are those of the first, steep ones, and too large where it has to settle;
+Adam's, one for each parameter, move one of which nothing is known by its noise as far as the others.) The temperature
+of the smoothing falls from step to step.
 
 The derivative of one long run need not say where the mean of many goes: a run's phase of oscillation depends on f times
 its whole length, and its loss ripples with f over less than a tenth of a hertz, steeply. So what is made small is the
@@ -129,12 +130,19 @@ def descend(
 
     Raises:
         NotFinite: if the objective is not finite at the start.
+        ValueError: if the history is of other work.
     """
     require_key("descend", key)
     history, free = list(history), problem.to_free(start)
     optimiser = schedule.optimiser(len(free))
     state = optimiser.init(jnp.asarray(free))
-    for step in history:
+    for k, step in enumerate(history):
+        led_to = problem.to_parameters(free)
+        if not np.allclose(list(step.parameters.values()), list(led_to.values()), rtol=1e-5, atol=0):
+            raise ValueError(
+                f"descend(history): step {k} was taken at {step.parameters}, but those before it lead to {led_to}: it "
+                "is of other work, or of another version; begin anew in another directory."
+            )
         free, state = _move(optimiser, free, state, step)
     num_scenes = len(jax.tree.leaves(problem.scenes)[0])
     # Lanes: scenes × seeds × the two of a pair. Every pair has a seed of its own.
@@ -170,9 +178,10 @@ def end_of(problem: Problem, schedule: Schedule, history: Sequence[Step]) -> dic
     return problem.to_parameters(np.mean(_last_quarter(places), axis=0))
 
 
-def last_loss(history: Sequence[Step]) -> float:
-    """Mean of the smoothed objective over the last quarter of the steps; NaN where one of them has none."""
-    return float(np.mean(_last_quarter([step.loss for step in history])))
+def last_loss(history: Sequence[Step]) -> tuple[float, float]:
+    """Mean of the smoothed objective over the last quarter of the steps, NaN where one has none; its standard error."""
+    losses, errors = (_last_quarter([getattr(step, name) for step in history]) for name in ("loss", "loss_se"))
+    return float(np.mean(losses)), float(np.linalg.norm(errors) / len(errors))
 
 
 def _last_quarter(values: list) -> list:

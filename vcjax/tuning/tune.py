@@ -38,6 +38,8 @@ class End(NamedTuple):
     setting: Setting
     smoothed_loss: float
     """Mean of the smoothed objective over the last quarter of its steps."""
+    smoothed_se: float
+    """Its standard error."""
     is_judged: bool
     """Whether it is a candidate of the choice."""
 
@@ -127,7 +129,7 @@ def tune(
     num_begun = sum(history is not None for history in before)
     given = {"objective": problem.objective, "seeds": seeds, "key": choice_key}
     if directory is not None:
-        check_directory(_choice_of(directory, num_begun), scenarios, config, 1 + _num_judged(num_begun), **given)
+        check_directory(choice_of(directory, num_begun), scenarios, config, 1 + _num_judged(num_begun), **given)
     descents, left_out = [], []
     for number, (start, history) in enumerate(zip(starts, before, strict=True)):
 
@@ -150,7 +152,7 @@ def tune(
         left_out.append(start)
     ends = _ends(problem, schedule, descents)
     candidates = [starts[0], *(end.setting for end in ends if end.is_judged)]
-    place = None if directory is None else _choice_of(directory, len(descents))
+    place = None if directory is None else choice_of(directory, len(descents))
     choice = choose(scenarios, config, candidates, directory=place, progress=progress, **given)
     runs_per_step = 2 * schedule.pairs_per_step * len(scenarios)
     return Tuned(descents, ends, choice, runs_per_step * (sum(map(len, descents)) + len(left_out)), origin, left_out)
@@ -158,9 +160,10 @@ def tune(
 
 def _ends(problem: Problem, schedule: Schedule, descents: Sequence[list[Step]]) -> list[End]:
     losses = [last_loss(steps) for steps in descents]
-    judged = np.argsort(losses, kind="stable")[: _num_judged(len(descents))]  # NaN comes last
+    order = np.argsort([loss for loss, _ in losses], kind="stable")  # NaN comes last
+    judged = order[: _num_judged(len(descents))]
     return [
-        End(end_of(problem, schedule, steps), loss, number in judged)
+        End(end_of(problem, schedule, steps), *loss, number in judged)
         for number, (steps, loss) in enumerate(zip(descents, losses, strict=True))
     ]
 
@@ -169,7 +172,7 @@ def _num_judged(num_descents: int) -> int:
     return min(num_descents, max(2, -(-num_descents // 2)))
 
 
-def _choice_of(directory: Path, num_descents: int) -> Path:
+def choice_of(directory: Path, num_descents: int) -> Path:
     """Where a choice is kept: another for more starts, so that these go on from the descents that there are."""
     return directory / f"choice_of_{num_descents}"
 
