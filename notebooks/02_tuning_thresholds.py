@@ -224,9 +224,9 @@ landscape_figure(
     [[step.parameters for step in descent]],
 )
 # %% [markdown]
-# The path goes straight out of the region where static features are deleted and stops in the valley, at its corner
-# since both thresholds started alike. From another start it ends on an arm; `num_starts` tries several and keeps the
-# best. With so few runs in a step, where it ends on the valley's flat ground says little.
+# The first step leaves the region where static features are deleted; the others go to and fro across the valley, by
+# less and less, on the arm where Th₂ decides. From another start it may be the other arm; `num_starts` tries several
+# and keeps the best. With so few runs in a step, where it ends along the arm says little.
 #
 # ## 4. Is it better?
 #
