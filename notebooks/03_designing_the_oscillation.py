@@ -321,8 +321,8 @@ assert tuned.num_runs == 96 and tuned.num_failed == 0
 assert weight_f < 0.05 < 0.3 < weight_a
 descent_figure(tuned.descents)
 # %% [markdown]
-# By A the derivatives have a large weight in most steps, and A goes up steadily. By f they have next to none: the pairs
-# take over. Where f goes is a matter of few runs, and of the price.
+# By A the derivatives have nearly all the weight, and A goes up. By f they have next to none: the pairs take over. Where
+# f goes is a matter of few runs, and of the price.
 
 # %%
 before, after = tuned.choice.before, tuned.choice.after
@@ -340,14 +340,14 @@ print(f"camera motion           {motion[0]:6.2f} → {motion[1]:6.2f} m²/s²")
 paired = compared["paired"][ALL]
 assert after[A] > 0.07 and paired["loss"]["upper"] < -0.05
 assert paired["dynamic_found_per_run"]["lower"] > 0.5
-assert paired["position_rmse_cm"]["lower"] < 0 < paired["position_rmse_cm"]["upper"]
-assert paired["static_deleted_per_run"]["mean"] < 1 and motion[1] > motion[0]
+assert paired["position_rmse_cm"]["upper"] < 0
+assert paired["static_deleted_per_run"]["mean"] < 1 and motion[1] > 2 * motion[0]
 assert round(0.02 * motion[0], 3) == 0.009
 
 # %% [markdown]
-# More movers are found, by more than the interval, and hardly a static feature is paid for it; whether the position
-# error falls is not decided by so few runs. The price is motion, and more of it. That is a choice of the objective,
-# whose weight makes the paper's oscillation cost no more than 0.009 of F1.
+# More movers are found and the position error falls, both by more than their intervals, and no static feature is paid
+# for it. The price is motion, nearly three times as much. That is a choice of the objective, whose weight makes the
+# paper's oscillation cost no more than 0.009 of F1.
 #
 # But the price grows with A·f, and what is seen with A alone. So the same motion as before can be had with the tuned
 # amplitude and a lower frequency:
