@@ -321,8 +321,8 @@ assert tuned.num_runs == 96 and tuned.num_failed == 0
 assert weight_f < 0.05 < 0.3 < weight_a
 descent_figure(tuned.descents)
 # %% [markdown]
-# By A the derivatives have nearly all the weight, and A goes up. By f they have next to none: the pairs take over. Where
-# f goes is a matter of few runs, and of the price.
+# By A the derivatives have nearly all the weight, and A goes up. By f they have next to none: the pairs take over.
+# Where f goes is a matter of few runs, and of the price.
 
 # %%
 before, after = tuned.choice.before, tuned.choice.after

@@ -137,11 +137,15 @@ BAD = {
     "NaN in the path": ("robot_tum.txt", b"1 nan 0 0 0 0 0 1\n", "'nan' is not a finite number"),
     "no tracks": ("tracks.csv", None, r"tracks\.csv: no such file"),
     "other columns": ("tracks.csv", b"track_id,margin\n1,2\n", "no column accepted"),
-    "negative id": ("tracks.csv", b"{head}-1,0,0,0,0,0,1,1\n", "line 2, column track_id: -1 is below 0"),
-    "negative count": ("tracks.csv", b"{head}1,0,0,-2,0,0,1,1\n", "line 2, column dynamic: -2 is below 0"),
-    "track twice": ("tracks.csv", b"{head}1,0,0,0,0,0,1,1\n1,0,0,0,0,0,1,1\n", "line 3, .*not above the one before"),
-    "infinite": ("tracks.csv", b"{head}1,0,0,0,0,0,inf,1\n", "line 2, column margin: inf"),
-    "half a count": ("tracks.csv", b"{head}1,0,0.5,0,0,0,1,1\n", "'0.5' is not a whole number"),
+    "negative id": ("tracks.csv", b"{head}-1,0,0,0,0,0,0,1,1\n", "line 2, column track_id: -1 is below 0"),
+    "negative count": ("tracks.csv", b"{head}1,0,0,-2,0,0,0,1,1\n", "line 2, column dynamic: -2 is below 0"),
+    "track twice": (
+        "tracks.csv",
+        b"{head}1,0,0,0,0,0,0,1,1\n1,0,0,0,0,0,0,1,1\n",
+        "line 3, .*not above the one before",
+    ),
+    "infinite": ("tracks.csv", b"{head}1,0,0,0,0,0,0,inf,1\n", "line 2, column margin: inf"),
+    "half a count": ("tracks.csv", b"{head}1,0,0.5,0,0,0,0,1,1\n", "'0.5' is not a whole number"),
 }
 
 

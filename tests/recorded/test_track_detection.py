@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 import vcjax as vc
 from vcjax.recorded.track_detection import labels_of, track_detection, track_detection_text
-from vcjax.recorded.verdicts import TrackVerdicts, track_verdicts, verdicts
+from vcjax.recorded.verdicts import DELETED, DYNAMIC, VERDICTS, TrackVerdicts, track_verdicts, verdicts
 from vcjax.sources.recording_file import RecordingFile, TrackLabel, TrackLabels
 from vcjax.study import roc
 
 
 def judged(margin, called, detector_margin=None) -> TrackVerdicts:
     """Tracks 0, 1, … with their margins, some of which were called dynamic."""
-    counts = np.zeros((len(margin), 5), np.int64)
-    counts[:, 2] = called
+    counts = np.zeros((len(margin), len(VERDICTS)), np.int64)
+    counts[:, DYNAMIC] = called
     detector = margin if detector_margin is None else detector_margin
     return TrackVerdicts(np.arange(len(margin)), counts, np.array(margin, float), np.array(detector, float))
 
@@ -41,7 +41,7 @@ def test_counts_and_figures_by_hand():
 
 def test_deleted_by_the_detector_counts_as_found():
     tracks = judged([1.0, 1.0], [0, 0])
-    tracks.counts[0, 4] = 1
+    tracks.counts[0, DELETED] = 1
     found = track_detection(tracks, TrackLabels(np.array([0, 1]), np.array([1, 0])))
     assert (found.num_found, found.num_false) == (1, 0)
 
