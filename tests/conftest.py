@@ -20,6 +20,18 @@ hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=No
 hypothesis.settings.load_profile("repeatable")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Compiled programs dropped before there are too many: each is several mappings, of which Linux allows 65 530.
+
+    Beyond them the next program is a crash of the interpreter.
+    """
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and len(mappings.read_bytes().splitlines()) > 20_000:
+        jax.clear_caches()
+
+
 @pytest.fixture
 def unchecked():
     """Run-time checks off, as users have it: bad input meets the package's own refusals."""
