@@ -1,5 +1,6 @@
 """Landmarks that the detector suspects, in whole runs: measured, tested, and left out until they are harmless."""
 
+import functools
 import itertools
 
 import jax
@@ -31,7 +32,9 @@ def test_where_nobody_is_suspect_nothing_changes():
     )  # from there on somebody may be suspect
     assert first > 5
     for (state, info), (other, other_info) in zip(plain[:first], careful[:first], strict=True):
-        jax.tree.map(np.testing.assert_array_equal, (state, info), (other, other_info))
+        # Two programs, which need not round alike.
+        same = functools.partial(np.testing.assert_allclose, rtol=1e-7, atol=1e-10)
+        jax.tree.map(same, (state, info), (other, other_info))
 
 
 def test_who_is_suspect_is_left_out_until_it_calms_down():
