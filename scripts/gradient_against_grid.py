@@ -4,7 +4,6 @@ python scripts/gradient_against_grid.py thresholds --points 20 --out results/pro
 """
 
 import dataclasses
-import json
 import os
 from pathlib import Path
 from typing import Literal
@@ -14,8 +13,10 @@ import numpy as np
 import tyro
 
 import vcjax as vc
+from vcjax.report.landscape import landscape_figure
+from vcjax.report.style import write_figure
 from vcjax.report.tuning import write_search, write_tuning
-from vcjax.storage import write_file
+from vcjax.storage import write_json
 from vcjax.study.summary import mean_and_error, student_t
 from vcjax.tuning.choice import Seeds
 from vcjax.tuning.descent import Schedule
@@ -53,8 +54,10 @@ class Study:
     """Number of the random keys, of which each of the three parts has its own."""
     grid_key: int | None = None
     """Number of the grid's, where a grid that was searched before is compared with other descents; `key` if None."""
+    seeds_by_scene: int = 100
+    """Runs of each scene on which either end is compared with the setting before, scene by scene."""
     out: Path = Path("results/gradient_against_grid")
-    """Directory; work that was stopped goes on there."""
+    """Directory; work that was stopped goes on there. Grids and descents have folders of their own, by their keys."""
 
 
 def main(study: Study) -> None:
@@ -69,9 +72,11 @@ def main(study: Study) -> None:
         axes = {path: np.linspace(i.low, i.high, study.points + 1)[1:] for path, i in intervals.items()}
     schedule = Schedule(num_steps=study.steps, pairs_per_step=study.pairs, learning_rate=study.learning_rate)
     config = vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")
-    of_grid = study.key if study.grid_key is None else study.grid_key
-    numbers = (3 * study.key + 1, 3 * of_grid + 2, 3 * study.key + 3)
+    of_descents, of_grid = study.key, study.key if study.grid_key is None else study.grid_key
+    numbers = (3 * of_descents + 1, 3 * of_grid + 2, 3 * of_descents + 3)
     gradient_key, grid_key, held_out_key = map(jax.random.key, numbers)
+    gradient, grid = directory / f"gradient_{of_descents}", directory / f"grid_{of_grid}"
+    both = directory / f"gradient_{of_descents}_against_grid_{of_grid}"
     tuned = tune(
         scenarios,
         config,
@@ -79,9 +84,9 @@ def main(study: Study) -> None:
         objective=WANTED,
         schedule=schedule,
         num_starts=study.starts,
-        seeds=Seeds(study.choosing_seeds, 100),
+        seeds=Seeds(study.choosing_seeds, study.seeds_by_scene),
         key=gradient_key,
-        directory=directory / "gradient",
+        directory=gradient,
         progress=lambda *done: print("gradient:", *done, flush=True),
     )
     found = search(
@@ -89,15 +94,19 @@ def main(study: Study) -> None:
         config,
         axes,
         objective=WANTED,
-        seeds=Seeds(study.grid_seeds, 100),
+        seeds=Seeds(study.grid_seeds, study.seeds_by_scene),
         key=grid_key,
-        directory=directory / "grid",
+        directory=grid,
         progress=lambda *done: print("grid:", *done, flush=True),
     )
-    write_tuning(tuned, {study.what: as_grid(found)}, directory / "gradient")
-    write_search(found, directory / "grid")
-
+    write_tuning(tuned, {}, gradient)
+    write_search(found, grid)
     settings = {"before": found.before, "gradient": tuned.choice.after, "grid": found.after}
+    marks = {"before": found.before, "end of the descents": tuned.choice.after, "the grid's best": found.after}
+    title = f"Hard decisions, means over 6 scenes × {study.grid_seeds} runs at every point"
+    ways = [[step.parameters for step in steps] for steps in tuned.descents]
+    write_figure(landscape_figure(as_grid(found), title, marks, ways), both / "landscape")
+
     runs = evaluate(
         scenarios,
         config,
@@ -105,12 +114,14 @@ def main(study: Study) -> None:
         objective=WANTED,
         num_seeds=study.held_out_seeds,
         key=held_out_key,
-        directory=directory / "held_out",
+        directory=both / "held_out",
     )
     loss = runs.loss.mean("scene", skipna=False)
+    loss = loss.where(loss.notnull().all("setting"))  # a seed that failed in one is in no mean
     difference = loss.sel(setting=1) - loss.sel(setting=2)
-    mean, error = mean_and_error(difference, difference.notnull())
-    half_width = float(error) * float(student_t(study.held_out_seeds))
+    counts = difference.notnull()
+    mean, error = mean_and_error(difference, counts)
+    half_width = float(error) * float(student_t(int(counts.sum())))
     grid_loss, num_gradient = float(loss.sel(setting=2).mean()), tuned.num_runs + tuned.choice.candidates.loss.size
     report = {
         "settings": settings,
@@ -118,10 +129,10 @@ def main(study: Study) -> None:
         "gradient_minus_grid_percent": [
             100 * value / grid_loss for value in (float(mean), float(mean) - half_width, float(mean) + half_width)
         ],
+        "held_out_seeds": int(counts.sum()),
         "runs": {"gradient": num_gradient, "grid": found.candidates.loss.size},
     }
-    print(json.dumps(report, indent=1))
-    write_file(directory / "report.json", f"{json.dumps(report, indent=1)}\n".encode())
+    print(write_json(both / "report.json", report).read_text())
 
 
 if __name__ == "__main__":

@@ -53,7 +53,10 @@ def test_tune_writes_its_proof_and_goes_on_where_it_stopped(tmp_path, capsys, mo
     monkeypatch.setattr(descent, "run_lanes", lambda *_: pytest.fail("worked again"))
     monkeypatch.setattr(evaluate, "run_lanes", lambda *_: pytest.fail("worked again"))
     before = (folder / "tune.json").read_bytes()
+    assert main([*arguments, "--landscape-points", "0"]) == 0
+    assert not list((folder / "figures").glob("landscape_*"))  # those that were not asked for now
     assert main(arguments) == 0 and (folder / "tune.json").read_bytes() == before
+    assert (folder / "figures" / "landscape_thresholds.png").is_file()
     said(capsys)
 
     # What is of other settings is refused before any work, as far as that can be known then.
@@ -125,6 +128,8 @@ def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
         (["sweep", "--x-range", "5", "1"], ["--x-range 5 1", "rising"]),
         (["sweep", "--y-range", "0", "1"], ["--y-range 0 1", "positive"]),
         (["sweep", "--y-points", "1"], ["--y-points 1", "at least two"]),
+        (["sweep", "--x-points", "100000"], ["--x-points 100000", "at most 200"]),
+        (["sweep", "--x", "config.temperature"], ["config.temperature", "no effect"]),
         (["sweep", "--seeds", "0"], ["choosing=0"]),
         (
             ["sweep", "--y", "scenario.oscillation.frequency_hz", "--y-range", "1", "9"],

@@ -127,6 +127,17 @@ def test_equal_settings_do_not_differ_whatever_failed(choice, failed_before, fai
         assert compared["before"]["metrics"][scene][RECALL]["se"] > 0.01
 
 
+def test_of_few_seeds_recall_has_no_interval(choice):
+    """Their resamples lie on one side of zero by chance: no interval, so nothing bold; of one no error either."""
+    for num, has_interval in ((1, False), (7, False), (8, True)):
+        few = comparison(choice._replace(held_out=choice.held_out.isel(seed=slice(num))))
+        for scene in SCENES:
+            recall = few["paired"][scene][RECALL]
+            assert recall["num_pairs"] == num and np.isfinite(recall["mean"])
+            assert np.isfinite([recall["lower"], recall["upper"]]).all() == has_interval
+            assert np.isfinite(few["before"]["metrics"][scene][RECALL]["se"]) == (num > 1)
+
+
 def test_recall_has_no_pairs_where_there_is_none(choice):
     """No mover among the tracks; and no seed that stayed finite on both sides."""
     static = choice.held_out.assign(track_score=choice.held_out.track_score.where(~choice.held_out.is_moving))

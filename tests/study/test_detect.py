@@ -255,6 +255,8 @@ def test_a_point_of_a_curve_has_the_interval_of_many_studies():
     never = operating_point(Counts(np.zeros(4), np.full(4, 6), np.zeros(4), np.full(4, 90)))
     assert never["found_of_mapped_fraction"] == {"mean": 0.0, "lower": 0.0, "upper": 0.0}
     assert np.isnan(list(never["precision"].values())).all()
+    one = operating_point(Counts(*(np.array([number]) for number in (4, 6, 1, 90))))["precision"]
+    assert one["mean"] == 0.8 and np.isnan([one["lower"], one["upper"]]).all()
 
 
 def test_counts_leave_failed_runs_out():

@@ -201,8 +201,18 @@ def test_tuning_descends_from_each_start_chooses_and_goes_on_where_it_stopped(tm
 
     with pytest.raises(ValueError, match=r"start_0\.json has other settings \(schedule\..*; give another directory"):
         tuned(tmp_path, schedule=Schedule(num_steps=3, pairs_per_step=1))
-    (tmp_path / "descents" / "start_0.json").write_text('{"origin": {}')
+    place = tmp_path / "descents" / "start_0.json"
+    content = json.loads(place.read_text())
+    first = content["steps"][0]
+    for broken in ({"loss": "x"}, {"parameters": 3}, {"gradient": {TH1: "x"}}, {"gradient": {"th1": 0.0}}, {"lost": 0}):
+        place.write_text(json.dumps(content | {"steps": [first | broken]}))
+        with pytest.raises(ValueError, match=r"start_0\.json: no steps of a descent"):
+            tuned(tmp_path)
+    place.write_text('{"origin": {}')
     with pytest.raises(ValueError, match=r"start_0\.json: no steps of a descent"):
+        tuned(tmp_path)
+    place.write_text(json.dumps(content | {"steps": [first | {"parameters": first["parameters"] | {TH1: 5.0}}]}))
+    with pytest.raises(ValueError, match=r"start_0\.json: descend\(history\): step 0 was taken at .*th1': 5\.0"):
         tuned(tmp_path)
 
 

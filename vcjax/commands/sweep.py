@@ -16,12 +16,15 @@ from vcjax.tuning.landscape import search
 from vcjax.tuning.losses import WANTED, Objective
 from vcjax.tuning.scenes import Scenes
 
+_MAX_POINTS = 200
+"""Along one axis: a grid of twice as many each way takes days, and its heat map shows no more."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
     """Run a grid over any two numbers of scenario and filter; draw what each point does; compare the best with before.
 
-    DIR holds every finished block of runs: a sweep that was stopped goes on there.
+    The directory `--out` holds every finished block of runs: a sweep that was stopped goes on there.
     """
 
     x: str = "config.gate.th1"
@@ -95,6 +98,6 @@ def _values(axis: str, ends: tuple[float, float], num: int, is_log: bool) -> np.
     low, high = ends
     if not (np.isfinite(low) and np.isfinite(high) and low < high and (low > 0 or not is_log)):
         raise ValueError(f"--{axis}-range {low:g} {high:g}: give two rising numbers, positive ones with --{axis}-log.")
-    if num < 2:
-        raise ValueError(f"--{axis}-points {num}: give at least two.")
+    if not 2 <= num <= _MAX_POINTS:
+        raise ValueError(f"--{axis}-points {num}: give at least two, and at most {_MAX_POINTS}.")
     return np.geomspace(low, high, num) if is_log else np.linspace(low, high, num)

@@ -30,7 +30,8 @@ _LANDSCAPE_SEEDS = 4
 class Tune:
     """Tune Th1 and Th2, A and f, or all four by gradient, one setting for all scenes, and prove it on other seeds.
 
-    DIR holds every step and every block of runs: tuning that was stopped goes on there to the same numbers.
+    The directory `--out` holds every step and every block of runs: tuning that was stopped goes on there to the same
+    numbers.
     """
 
     what: tyro.conf.Positional[What]
@@ -52,9 +53,10 @@ class Tune:
     smoothing: Literal["soft", "straight_through"] = "soft"
     """"soft" has a true gradient, "straight_through" the hard filter's numbers."""
     starts: int = 3
-    """Descents: from the setting before, and from points spread over what is allowed."""
+    """Descents: from the setting before, and from points spread over what is allowed. Of more than two, the better half
+    of the ends by smoothed loss are candidates."""
     choosing_seeds: int = 48
-    """Runs of each scene by which the best end of a descent is chosen."""
+    """Runs of each scene by which the best of the candidates is chosen."""
     held_out_seeds: int = 100
     """Runs of each scene on which it is compared with the setting before."""
     landscape_points: int = 8

@@ -20,6 +20,8 @@ _DECIMALS = dict.fromkeys((*COMPARED, RECALL), 2) | {
     "orientation_error_deg": 3,
     "camera_motion_m2_s2": 3,
 }
+_MIN_PAIRS = 8
+"""Of fewer, resamples all lie on one side of zero by mere chance too often for an interval of 95 %."""
 _LABELS = COMPARED | {RECALL: "recall at 1 % static"}
 _TABLES = (
     ("detection_f1", RECALL, "position_rmse_cm"),
@@ -49,8 +51,8 @@ def comparison(choice: Choice) -> dict[str, Any]:
     run that failed in some scene, and so are in no mean over all scenes) and by scene, the last of which is all of
     them, `metrics`: each figure with `mean` and `se`. `paired` holds by scene and figure the `mean` of after -
     before, its 95 % interval `lower` to `upper`, and `num_pairs`: how many seeds count, which are those that
-    stayed finite and have the figure on both sides. Recall at 1 % static has its se and interval by bootstrap; the
-    others are Student-t.
+    stayed finite and have the figure on both sides. Recall at 1 % static has its se by bootstrap, and from 8 pairs on
+    its interval; the others are Student-t.
     """
     runs = [choice.held_out.isel(setting=i, drop=True) for i in (0, 1)]
     scenes, tracks = [by_scene(each) for each in runs], [tracks_of(each) for each in runs]
@@ -152,12 +154,16 @@ def _recall(tracks: roc.Tracks) -> tuple[float, np.ndarray]:
 
 
 def _recall_difference(tracks: Sequence[roc.Tracks], is_pair: np.ndarray) -> dict[str, Any]:
-    """After - before of the seeds that stayed finite in both, with its interval by the same resamples of them."""
+    """After - before of the seeds that stayed finite in both, with its interval by the same resamples of them.
+
+    There is none of few seeds, see `_MIN_PAIRS`.
+    """
     mean = lower = upper = math.nan
     if np.any(is_pair):
         before, after = (_recall(roc.Tracks(each.score[is_pair], each.is_mover[is_pair])) for each in tracks)
         mean = after[0] - before[0]
-        lower, upper = map(float, roc.interval(after[1] - before[1]))
+        if np.sum(is_pair) >= _MIN_PAIRS:
+            lower, upper = map(float, roc.interval(after[1] - before[1]))
     num = int(np.sum(is_pair)) if _is_finite(mean) else 0
     return {"mean": mean, "lower": lower, "upper": upper, "num_pairs": num}
 

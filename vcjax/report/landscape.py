@@ -42,7 +42,7 @@ def landscape_figure(
         grid: runs (x, y, scene, seed), as from `landscape.as_grid`.
         title: what is shown.
         marks: settings to mark, by name.
-        paths: settings one after another, drawn as lines: the paths of descents.
+        paths: settings one after another, drawn as lines with their numbers: the paths of descents.
     """
     x, y = (str(dim) for dim in grid.loss.dims[:2])
     figure = new_figure(8.6, 6.6)
@@ -60,8 +60,12 @@ def landscape_figure(
         for number, path in enumerate(paths):
             way = [p[x] for p in path], [p[y] for p in path]
             outline = [patheffects.Stroke(linewidth=2.4, foreground="black"), patheffects.Normal()]  # for bright ground
-            label = None if number else "a descent"
-            axes.plot(*way, color="white", linewidth=1.2, marker=".", markersize=3, path_effects=outline, label=label)
+            label = None if number else "descents, numbered where they start"
+            style = {"color": "white", "path_effects": outline}
+            axes.plot(*way, linewidth=1.2, marker=".", markersize=3, label=label, **style)
+            axes.annotate(
+                f"{number + 1}", (way[0][0], way[1][0]), (4, 4), textcoords="offset points", fontsize=8, **style
+            )
         # One setting may be another: then the mark of the first is seen around that of the second.
         for (mark, setting), symbol, size in zip((marks or {}).items(), "os^D", (12, 8, 8, 8), strict=False):
             style = {"color": "#d55e00", "markeredgecolor": "white", "markersize": size, "label": mark}

@@ -31,6 +31,8 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     the descents, each with the `smoothed_loss` in the last quarter of its descent and its `loss` on the seeds that
     chose, mean and standard error, null where that was not asked (`is_judged`).
 
+    Figures of landscapes that an earlier tuning left there are removed.
+
     Args:
         tuned: the tuning.
         landscapes: grids over two of the numbers, by name, on which the paths are drawn.
@@ -55,6 +57,9 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     folder = directory / "figures"
     paths += write_figure(descent_figure(tuned.descents), folder / "descent")
     marks = _marks(tuned.choice, "after")
+    # Those of an earlier choice would show another end.
+    for old in folder.glob("landscape_*"):
+        old.unlink()
     for name, grid in landscapes.items():
         others = {path: value for path, value in tuned.choice.after.items() if path not in grid.dims}
         title = f"Hard decisions, {_means(grid)}" + (", the other numbers as tuned" if others else "")

@@ -127,7 +127,10 @@ def area(tracks: Tracks, weights: Float[np.ndarray, "b seed"] | None = None) -> 
 def resampled(
     curve: Callable[..., np.ndarray], tracks: Tracks, levels: Float[np.ndarray, " r"], num: int = NUM_RESAMPLES
 ) -> Float[np.ndarray, "b r"]:
-    """`recall_at` or `precision_at` of every resample; a few at a time, which bounds the memory."""
+    """`recall_at` or `precision_at` of every resample; NaN of a single seed, which says nothing of others."""
+    if len(tracks.score) < 2:
+        return np.full((num, len(levels)), np.nan)
+    # A few at a time, which bounds the memory.
     weights = resamples(len(tracks.score), num)
     return np.concatenate([curve(tracks, levels, weights[i : i + 50]) for i in range(0, num, 50)])
 

@@ -5,7 +5,8 @@ its gradient over a mini-batch of seeds, new in every step, and over all scenes.
 units of its standard errors, (∂L/∂xᵢ)/sᵢ: not how much a parameter matters, but how sure it is which way it has to go,
 so that one whose gradient is mostly noise neither hides the others nor is moved far. A step is as long as the learning
 rate where this is sure, and shorter where it is less so: its norm counts up to √2 errors in each parameter, so that
-one of nothing but noise moves by about 0.6 of the learning rate, in no direction in particular. (Units that an
+nothing but noise moves it by 0.6 of the learning rate where the errors are known from many pairs, and by up to 0.8
+where they are known from two, in no direction in particular. The learning rate falls by a cosine. (Units that an
 optimiser learns from earlier gradients are those of the first, steep ones, and too large where it has to settle;
 Adam's, one for each parameter, move one of which nothing is known by its noise as far as the others.) The temperature
 of the smoothing falls from step to step.

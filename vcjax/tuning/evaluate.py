@@ -142,6 +142,8 @@ def _columns(scenarios, config, settings: Settings, num_seeds: int, key) -> dict
     require_kind("evaluate", "settings", settings, Mapping, remedy)
     if not settings:
         raise ValueError(f"evaluate(settings={{}}): {remedy}")
+    if "config.temperature" in settings:
+        raise ValueError("evaluate(settings): config.temperature smooths, and has no effect on hard decisions.")
     columns = {path: as_numbers(values) for path, values in settings.items()}
     lengths = {values.shape for values in columns.values()}
     if len(lengths) > 1 or any(len(shape) != 1 or shape[0] == 0 for shape in lengths):

@@ -148,6 +148,8 @@ def tune(
                 # Where the parameters are, this is for the user to know; elsewhere it is one start less.
                 if number == 0:
                     raise
+            except ValueError as error:
+                raise ValueError(f"{kept[number].path}: {error}") from None
             kept[number].write(None)
         left_out.append(start)
     ends = _ends(problem, schedule, descents)
@@ -231,12 +233,28 @@ class _KeptSteps(NamedTuple):
         try:
             content = json.loads(self.path.read_text())
             found, steps = content["origin"] | {"start": content["start"]}, content["steps"]
-            steps = None if steps is None else [Step(**_with_nan(step)) for step in steps]
-        except (ValueError, TypeError, KeyError) as error:
+            steps = None if steps is None else [_step(step, self.start) for step in steps]
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise ValueError(f"{self.path}: no steps of a descent ({error}); remove it and run again.") from None
         expected = json.loads(json.dumps(with_nulls(self.origin | {"start": self.start})))
         refuse_other_settings(self.path, with_nulls(found), expected)
         return steps
+
+
+def _step(content: dict[str, Any], setting: Setting) -> Step:
+    """A step as it was kept.
+
+    Raises:
+        ValueError, TypeError: if it is of other parameters, or something in it is no number.
+    """
+    step = Step(**_with_nan(content))
+    tables = (step.parameters, step.gradient, step.gradient_se, step.pathwise)
+    if any(list(table) != list(setting) for table in tables):
+        raise ValueError("a step of other parameters")
+    numbers = [step.temperature, step.loss, step.loss_se, step.num_failed]
+    if not all(isinstance(n, int | float) for n in (*numbers, *(n for table in tables for n in table.values()))):
+        raise TypeError("a step with something that is no number")
+    return step
 
 
 def _with_nan(value: Any) -> Any:
