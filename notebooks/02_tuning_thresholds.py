@@ -25,7 +25,8 @@
 #
 # The setting is small, so that all of it takes some minutes: two scenes and few seeds. `vcjax tune thresholds` and
 # `vcjax sweep` do the same with all six of the paper's dynamic scenes and 100 seeds held out, which takes much longer.
-# [01_getting_started](01_getting_started.py) explains the gate; the numbers in the text are asserted in the cells.
+# [01_getting_started](01_getting_started.py) explains the gate. What the text says of numbers is asserted in the
+# cells, with room for another machine's rounding.
 
 # %%
 import jax
@@ -225,7 +226,7 @@ landscape_figure(
 )
 # %% [markdown]
 # The first step leaves the region where static features are deleted; the others go to and fro across the valley, by
-# less and less, on the arm where Th₂ decides. From another start it may be the other arm; `num_starts` tries several
+# less and less. From another start it may be the other arm; `num_starts` tries several
 # and keeps the best. With so few runs in a step, where it ends along the arm says little.
 #
 # ## 4. Is it better?

@@ -39,7 +39,7 @@ class Study:
     """Their speeds, m/s."""
     motion_weight: float = 0.02
     """What 1 m²/s² of the camera's mean square speed costs beside 1 - F1."""
-    starts: int = 1
+    starts: int = 3
     """Descents, the first from A and f before."""
     steps: int = 15
     """Steps of each."""

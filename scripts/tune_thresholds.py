@@ -32,7 +32,7 @@ class Study:
     """Speeds of the dynamic features, m/s; they move sideways in one scene and towards the robot in another."""
     position_weight: float = 2.0
     """What 1 m of position error costs beside 1 - F1; 0: detection alone."""
-    starts: int = 1
+    starts: int = 3
     """Descents, the first from the thresholds before."""
     steps: int = 15
     """Steps of each."""
