@@ -58,6 +58,7 @@ def test_other_numbers_do_not_compile_again(states, recording):
         linearity_max=0.05,
         birth_margin_px=40.0,
     )
+    recorded(seed=4711, **MOVING)  # so that its program is there, even if that of `recording` was dropped since
     compiled = simulate_once, start, step
     num_compiled = [function._cache_size() for function in compiled]
     scenario = dict(
