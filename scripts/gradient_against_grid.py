@@ -44,6 +44,8 @@ class Study:
     """Steps of each."""
     learning_rate: float = 0.3
     """How far the first of them goes in the free numbers."""
+    near: int = 0
+    """Candidates from around the best end."""
     pairs: int = 4
     """Pairs of runs of each scene in a step."""
     choosing_seeds: int = 69
@@ -84,6 +86,7 @@ def main(study: Study) -> None:
         objective=WANTED,
         schedule=schedule,
         num_starts=study.starts,
+        num_near=study.near,
         seeds=Seeds(study.choosing_seeds, study.seeds_by_scene),
         key=gradient_key,
         directory=gradient,

@@ -217,7 +217,7 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     settings = [{path: float(points[path][i]) for path in (TH1, TH2)} for i in (1, 2)]
     other = {TH1: 5.0, TH2: 6.0}
     ends = [End(settings[0], 0.25, 0.01, True), End(other, 0.5, 0.02, False), End(settings[1], 0.375, np.nan, True)]
-    tuned = Tuned([steps] * 3, ends, choice, 96, origin, left_out)
+    tuned = Tuned([steps] * 3, ends, [], choice, 96, origin, left_out)
     paths = write_tuning(tuned, {"thresholds": grid}, tmp_path / "tune")
     told = "1 of 4 starts were left out, 3 of 12 steps were not taken, 21 of 48 pairs of runs were left out of steps"
     assert told in (tmp_path / "tune" / "tune.md").read_text()
@@ -231,9 +231,10 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     before, failed, unasked, after = content["candidates"]
     assert before["parameters"] == choice.before and after["parameters"] == choice.after
     nothing = {"mean": None, "se": None}
-    for candidate, end in ((failed, ends[0]), (unasked, ends[1])):
-        smoothed = {"mean": end.smoothed_loss, "se": end.smoothed_se}
-        expected = {"parameters": end.setting, "smoothed_loss": smoothed, "is_judged": end.is_judged, "loss": nothing}
+    for number, (candidate, end) in enumerate(((failed, ends[0]), (unasked, ends[1])), start=1):
+        name, smoothed = f"end of descent {number}", {"mean": end.smoothed_loss, "se": end.smoothed_se}
+        expected = {"name": name, "parameters": end.setting, "smoothed_loss": smoothed, "is_judged": end.is_judged}
+        expected |= {"loss": nothing}
         assert candidate == expected
     assert before["smoothed_loss"] == nothing and before["is_judged"]
     assert after["smoothed_loss"] == {"mean": 0.375, "se": None}

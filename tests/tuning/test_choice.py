@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tiny_runs
 import xarray as xr
+from scipy import stats
 
 from vcjax.tuning import choice as module
 from vcjax.tuning import descent
@@ -198,6 +199,14 @@ def test_tuning_descends_from_each_start_chooses_and_goes_on_where_it_stopped(tm
     judged = [end.setting for end in more.ends if end.is_judged]
     np.testing.assert_allclose(more.choice.candidates[TH1][1:], [setting[TH1] for setting in judged], rtol=1e-12)
     assert tuned(tmp_path).choice.after == whole.choice.after and len(steps) == 3
+    # So is what lies around the best end: quantiles of the neighbourhood, at 1/2, 1/4, 3/4 and 1/3, 2/3, 1/9.
+    near = tuned(tmp_path, num_starts=3, num_near=3)
+    assert len(steps) == 3 and near.ends == more.ends and near.choice.candidates.sizes["setting"] == 1 + 2 + 3
+    best = problem.to_free(min(more.ends, key=lambda end: end.smoothed_loss).setting)
+    for path, k, levels in ((TH1, 0, [0.5, 0.25, 0.75]), (TH2, 1, [1 / 3, 2 / 3, 1 / 9])):
+        x = [problem.to_free(setting)[k] for setting in near.near]
+        np.testing.assert_allclose(x, stats.norm(best[k], 0.05).ppf(levels), rtol=1e-6)
+        np.testing.assert_allclose(near.choice.candidates[path][3:], [each[path] for each in near.near], rtol=1e-12)
 
     with pytest.raises(ValueError, match=r"start_0\.json has other settings \(schedule\..*; give another directory"):
         tuned(tmp_path, schedule=Schedule(num_steps=3, pairs_per_step=1))
@@ -220,6 +229,7 @@ def test_bad_tuning_is_refused_before_any_work(monkeypatch, unchecked):
     monkeypatch.setattr(descent, "run_lanes", lambda *_: pytest.fail("worked"))
     for options, message in (
         ({"num_starts": 0}, r"num_starts=0\): give a whole number of at least 1"),
+        ({"num_near": -1}, r"num_near=-1\): give a whole number"),
         ({"num_starts": True}, r"num_starts=True\): give a whole number"),
         ({"schedule": 3}, r"schedule=3\): give a Schedule"),
         ({"seeds": 3}, r"tune\(seeds=3\): give Seeds"),

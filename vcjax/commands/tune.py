@@ -55,6 +55,8 @@ class Tune:
     starts: int = 3
     """Descents: from the setting before, and from points spread over what is allowed. Of more than two, the better half
     of the ends by smoothed loss are candidates."""
+    near: int = 0
+    """Candidates more, from around the best end: where runs ripple with a number, as with f."""
     choosing_seeds: int = 48
     """Runs of each scene by which the best of the candidates is chosen."""
     held_out_seeds: int = 100
@@ -84,7 +86,7 @@ class Tune:
         for name in chosen if self.landscape_points else ():
             given = {"objective": self.objective, "num_seeds": _LANDSCAPE_SEEDS, "key": key}
             num_settings = self.landscape_points**2
-            place = _landscape_in(choice_of(directory, self.starts), name)
+            place = _landscape_in(choice_of(directory, self.starts, self.near), name)
             check_blocks(place, scenarios, config, None, num_settings, **given)
         with progress_bar(console, "compiling, first step") as show:
             tuned = tune(
@@ -94,6 +96,7 @@ class Tune:
                 objective=self.objective,
                 schedule=self.schedule,
                 num_starts=self.starts,
+                num_near=self.near,
                 seeds=seeds,
                 key=key,
                 directory=directory,
@@ -109,7 +112,7 @@ class Tune:
                     num_points=self.landscape_points,
                     num_seeds=_LANDSCAPE_SEEDS,
                     key=key,
-                    directory=_landscape_in(choice_of(directory, len(tuned.descents)), name),
+                    directory=_landscape_in(choice_of(directory, len(tuned.descents), self.near), name),
                     progress=lambda done, total, name=name: show(done, total, f"landscape of {name}"),
                 )
                 for name, pair in chosen.items()

@@ -27,9 +27,10 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
 
     `tune.json` is a `comparison` with the `history` of every descent, each step with its parameters, temperature,
     smoothed loss and gradient; how many runs there were, and starts, steps and pairs of runs that were left out; what
-    was `wanted`, the weights of the objective; the `origin` of it all; and the `candidates`, setting before and ends of
-    the descents, each with the `smoothed_loss` in the last quarter of its descent and its `loss` on the seeds that
-    chose, mean and standard error, null where that was not asked (`is_judged`).
+    was `wanted`, the weights of the objective; the `origin` of it all; and the `candidates`, setting before, ends of
+    the descents and what was tried near the best of them, each with its `name`, the `smoothed_loss` in the last quarter
+    of its descent and its `loss` on the seeds that chose, mean and standard error, null where that was not asked
+    (`is_judged`).
 
     Figures of landscapes that an earlier tuning left there are removed.
 
@@ -157,23 +158,27 @@ def _candidates(tuned: Tuned) -> list[dict[str, Any]]:
     loss = tuned.choice.candidates.loss.mean("scene", skipna=False)
     mean, error = mean_and_error(loss, xr.ones_like(loss, bool))
     costs = iter(zip(mean.values.tolist(), error.values.tolist(), strict=True))
+    before, *near = (End(setting, math.nan, math.nan, True) for setting in (tuned.choice.before, *tuned.near))
+    named = [("before", before)]
+    named += [(f"end of descent {number}", end) for number, end in enumerate(tuned.ends, start=1)]
+    named += [(f"near the best end, {number}", end) for number, end in enumerate(near, start=1)]
     return [
         {
+            "name": name,
             "parameters": dict(end.setting),
             "smoothed_loss": {"mean": end.smoothed_loss, "se": end.smoothed_se},
             "is_judged": end.is_judged,
             "loss": dict(zip(("mean", "se"), next(costs) if end.is_judged else (math.nan, math.nan), strict=True)),
         }
-        for end in (End(tuned.choice.before, math.nan, math.nan, True), *tuned.ends)
+        for name, end in named
     ]
 
 
 def _costs(compared: Mapping[str, Any]) -> str:
     """The candidates as a table; bold what was chosen."""
-    rows, ends = [], compared["candidates"][1:]
-    for number, candidate in enumerate(compared["candidates"]):
-        values = candidate["parameters"]
-        name = f"end of descent {number}" if number else "before"
+    rows, ends = [], [candidate for candidate in compared["candidates"] if candidate["name"].startswith("end")]
+    for candidate in compared["candidates"]:
+        values, name = candidate["parameters"], candidate["name"]
         name = f"**{name}**" if values == compared["after"]["parameters"] else name
         costs = (_with_error(candidate[each]) for each in ("smoothed_loss", "loss"))
         rows.append([name, *(f"{value:.4g}" for value in values.values()), *costs])

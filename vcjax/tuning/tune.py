@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
-from scipy.stats import qmc
+from scipy.stats import norm, qmc
 
 from vcjax.fields import require_key, require_kind, require_whole
 from vcjax.filter.config import FilterConfig
@@ -51,6 +51,8 @@ class Tuned(NamedTuple):
     """Every step from every start that was not left out; the first is where the parameters were."""
     ends: list[End]
     """Where each of them has led."""
+    near: list[Setting]
+    """Candidates from around the end of the smallest smoothed loss."""
     choice: Choice
     """Where the parameters were, the best end of a descent, and what it is worth."""
     num_runs: int
@@ -85,6 +87,7 @@ def tune(
     objective: Objective | None = None,
     schedule: Schedule | None = None,
     num_starts: int = 1,
+    num_near: int = 0,
     seeds: Seeds | None = None,
     key: PRNGKeyArray,
     directory: str | Path | None = None,
@@ -102,6 +105,9 @@ def tune(
             (a Halton sequence), since an objective may have several valleys. One of the others where the objective is
             not finite is left out. Of more than two, the better half of the ends, by the smoothed loss of their
             descents, is judged by hard decisions: so a choice costs less, and may have more seeds.
+        num_near: further candidates, from around the end of the smallest smoothed loss: points of the neighbourhood
+            over which its descent averaged, x + σz with z spread as a normal distribution (a Halton sequence). Where
+            runs ripple with a parameter, that mean cannot say where in the neighbourhood it is best.
         seeds: to choose the best end of a descent, and to compare it with the start.
         key: base key.
         directory: where the work is kept, and looked for.
@@ -119,6 +125,7 @@ def tune(
     require_kind("tune", "schedule", schedule, Schedule, "give a Schedule, e.g. Schedule(num_steps=20).")
     require_kind("tune", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=48, held_out=100).")
     require_whole("tune", "num_starts", num_starts, 1)
+    require_whole("tune", "num_near", num_near, 0)
     directory = as_directory("tune", directory)
     problem = problem_of(scenarios, config, parameters, objective)
     starts = _starts(problem, setting_of(scenarios, config, problem.paths), num_starts)
@@ -129,7 +136,8 @@ def tune(
     num_begun = sum(history is not None for history in before)
     given = {"objective": problem.objective, "seeds": seeds, "key": choice_key}
     if directory is not None:
-        check_directory(choice_of(directory, num_begun), scenarios, config, 1 + _num_judged(num_begun), **given)
+        num_candidates = 1 + _num_judged(num_begun) + num_near
+        check_directory(choice_of(directory, num_begun, num_near), scenarios, config, num_candidates, **given)
     descents, left_out = [], []
     for number, (start, history) in enumerate(zip(starts, before, strict=True)):
 
@@ -153,11 +161,13 @@ def tune(
             kept[number].write(None)
         left_out.append(start)
     ends = _ends(problem, schedule, descents)
-    candidates = [starts[0], *(end.setting for end in ends if end.is_judged)]
-    place = None if directory is None else choice_of(directory, len(descents))
+    near = _near(problem, ends, num_near)
+    candidates = [starts[0], *(end.setting for end in ends if end.is_judged), *near]
+    place = None if directory is None else choice_of(directory, len(descents), num_near)
     choice = choose(scenarios, config, candidates, directory=place, progress=progress, **given)
     runs_per_step = 2 * schedule.pairs_per_step * len(scenarios)
-    return Tuned(descents, ends, choice, runs_per_step * (sum(map(len, descents)) + len(left_out)), origin, left_out)
+    num_runs = runs_per_step * (sum(map(len, descents)) + len(left_out))
+    return Tuned(descents, ends, near, choice, num_runs, origin, left_out)
 
 
 def _ends(problem: Problem, schedule: Schedule, descents: Sequence[list[Step]]) -> list[End]:
@@ -174,9 +184,17 @@ def _num_judged(num_descents: int) -> int:
     return min(num_descents, max(2, -(-num_descents // 2)))
 
 
-def choice_of(directory: Path, num_descents: int) -> Path:
-    """Where a choice is kept: another for more starts, so that these go on from the descents that there are."""
-    return directory / f"choice_of_{num_descents}"
+def _near(problem: Problem, ends: Sequence[End], num: int) -> list[Setting]:
+    """Points of the neighbourhood of the best end."""
+    best = problem.to_free(ends[int(np.argsort([end.smoothed_loss for end in ends], kind="stable")[0])].setting)
+    spread = np.array([float(interval.spread) for interval in problem.intervals])
+    z = norm.ppf(qmc.Halton(len(spread), scramble=False).random(num + 1)[1:])  # its first point is at infinity
+    return [problem.to_parameters(best + spread * each) for each in z]
+
+
+def choice_of(directory: Path, num_descents: int, num_near: int) -> Path:
+    """Where a choice is kept: another for more candidates, so that these go on from the descents that there are."""
+    return directory / (f"choice_of_{num_descents}" + (f"_and_{num_near}_near" if num_near else ""))
 
 
 def _starts(problem: Problem, before: dict[str, float], num: int) -> list[dict[str, float]]:
