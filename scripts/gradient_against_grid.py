@@ -105,7 +105,7 @@ def main(study: Study) -> None:
     write_tuning(tuned, {}, gradient)
     write_search(found, grid)
     settings = {"before": found.before, "gradient": tuned.choice.after, "grid": found.after}
-    marks = {"before": found.before, "end of the descents": tuned.choice.after, "the grid's best": found.after}
+    marks = {"before": found.before, "by gradient": tuned.choice.after, "the grid's best": found.after}
     title = f"Hard decisions, means over 6 scenes × {study.grid_seeds} runs at every point"
     ways = [[step.parameters for step in steps] for steps in tuned.descents]
     write_figure(landscape_figure(as_grid(found), title, marks, ways), both / "landscape")
