@@ -39,6 +39,8 @@ class Study:
 def main(study: Study) -> None:
     paths = (*THRESHOLDS, *OSCILLATION)
     settings = [dict(zip(paths, values, strict=True)) for values in study.settings]
+    if len(settings) < 2:
+        raise SystemExit("--settings: give at least two, four numbers each.")
     runs = evaluate(
         Scenes(speeds_m_s=study.speeds_m_s).make(),
         vc.FilterConfig(gate=vc.VirtualCorrection()),
@@ -51,6 +53,7 @@ def main(study: Study) -> None:
     )
     for i, setting in enumerate(settings[1:], start=1):
         compared = comparison(Choice(settings[0], setting, runs, runs.isel(setting=[0, i]), {}))
+        del compared["runs"]  # nothing was chosen
         text = comparison_markdown(compared)
         print(f"\n{text}")
         write_json(study.out / f"setting_{i}.json", compared)

@@ -25,7 +25,7 @@ from vcjax.tuning.intervals import OSCILLATION, THRESHOLDS
 from vcjax.tuning.landscape import as_grid, search
 from vcjax.tuning.losses import WANTED
 from vcjax.tuning.scenes import Scenes
-from vcjax.tuning.tune import tune
+from vcjax.tuning.tune import choice_of, tune
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Study:
     learning_rate: float = 0.3
     """How far the first of them goes in the free numbers."""
     near: int = 0
-    """Candidates from around the best end."""
+    """Candidates from around the end of the smallest smoothed loss."""
     pairs: int = 4
     """Pairs of runs of each scene in a step."""
     choosing_seeds: int = 69
@@ -78,7 +78,6 @@ def main(study: Study) -> None:
     numbers = (3 * of_descents + 1, 3 * of_grid + 2, 3 * of_descents + 3)
     gradient_key, grid_key, held_out_key = map(jax.random.key, numbers)
     gradient, grid = directory / f"gradient_{of_descents}", directory / f"grid_{of_grid}"
-    both = directory / f"gradient_{of_descents}_against_grid_{of_grid}"
     tuned = tune(
         scenarios,
         config,
@@ -102,6 +101,8 @@ def main(study: Study) -> None:
         directory=grid,
         progress=lambda *done: print("grid:", *done, flush=True),
     )
+    both = directory / f"gradient_{of_descents}_against_grid_{of_grid}"
+    both /= choice_of(Path(), len(tuned.descents), study.near)
     write_tuning(tuned, {}, gradient)
     write_search(found, grid)
     settings = {"before": found.before, "gradient": tuned.choice.after, "grid": found.after}

@@ -210,14 +210,14 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     steps = [Step({TH1: 9.0 + k, TH2: 9.0 - k}, 1.0, 0.5, np.nan, {TH1: 0.1, TH2: 0.2}, {}, {}, k) for k in range(3)]
     steps.append(Step({TH1: 12.0, TH2: 6.0}, 1.0, np.nan, np.nan, {TH1: np.nan, TH2: np.nan}, {}, {}, 4))
     left_out = [{TH1: 50.0, TH2: 1.0}]
-    points = choice.candidates.isel(setting=[0, 4, 9]).copy(deep=True)
+    points = choice.candidates.isel(setting=[0, 4, 9, 2]).copy(deep=True)
     points.loss[1, 0, 2] = np.nan
     choice = choice._replace(candidates=points)
     origin = {"vcjax": "1", "parameters": {TH1: "between"}}
     settings = [{path: float(points[path][i]) for path in (TH1, TH2)} for i in (1, 2)]
     other = {TH1: 5.0, TH2: 6.0}
     ends = [End(settings[0], 0.25, 0.01, True), End(other, 0.5, 0.02, False), End(settings[1], 0.375, np.nan, True)]
-    tuned = Tuned([steps] * 3, ends, [], choice, 96, origin, left_out)
+    tuned = Tuned([steps] * 3, ends, [{TH1: 7.0, TH2: 4.0}], choice, 96, origin, left_out)
     paths = write_tuning(tuned, {"thresholds": grid}, tmp_path / "tune")
     told = "1 of 4 starts were left out, 3 of 12 steps were not taken, 21 of 48 pairs of runs were left out of steps"
     assert told in (tmp_path / "tune" / "tune.md").read_text()
@@ -228,7 +228,10 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     assert content["starts_left_out"] == left_out
     assert content["wanted"] == describe(Objective(position=2.0))
     assert content["origin"] == {"vcjax": "1", "seeds": describe(Seeds(3, 30)), "parameters": {TH1: "between"}}
-    before, failed, unasked, after = content["candidates"]
+    before, failed, unasked, after, near = content["candidates"]
+    losses = points.loss[3].mean("scene")
+    assert near["name"] == "near the end of descent 1, 1" and near["parameters"] == {TH1: 7.0, TH2: 4.0}
+    assert near["loss"]["mean"] == pytest.approx(float(losses.mean())) and near["is_judged"]
     assert before["parameters"] == choice.before and after["parameters"] == choice.after
     nothing = {"mean": None, "se": None}
     for number, (candidate, end) in enumerate(((failed, ends[0]), (unasked, ends[1])), start=1):

@@ -213,7 +213,14 @@ def test_tuning_descends_from_each_start_chooses_and_goes_on_where_it_stopped(tm
     place = tmp_path / "descents" / "start_0.json"
     content = json.loads(place.read_text())
     first = content["steps"][0]
-    for broken in ({"loss": "x"}, {"parameters": 3}, {"gradient": {TH1: "x"}}, {"gradient": {"th1": 0.0}}, {"lost": 0}):
+    for broken in (
+        {"loss": "x"},
+        {"parameters": 3},
+        {"gradient": {TH1: "x"}},
+        {"gradient": {"th1": 0.0}},
+        {"lost": 0},
+        {"num_failed": 1.5},
+    ):
         place.write_text(json.dumps(content | {"steps": [first | broken]}))
         with pytest.raises(ValueError, match=r"start_0\.json: no steps of a descent"):
             tuned(tmp_path)
@@ -255,7 +262,7 @@ def broken_at(*starts: int):
             raise descent.NotFinite(f"the objective is not finite at the start, {start}; start elsewhere.")
         nan = dict.fromkeys(start, np.nan)
         steps = list(history) or [
-            descent.Step(dict(start), 1.0, 0.5, np.nan, dict.fromkeys(start, 0.1), dict.fromkeys(start, 0.02), {}, 1),
+            descent.Step(dict(start), 1.0, 0.5, np.nan, *(dict.fromkeys(start, each) for each in (0.1, 0.02, 1.0)), 1),
             descent.Step(dict(start), 0.5, np.nan, np.nan, nan, nan, nan, 2),
         ]
         progress(steps)

@@ -56,7 +56,7 @@ class Tune:
     """Descents: from the setting before, and from points spread over what is allowed. Of more than two, the better half
     of the ends by smoothed loss are candidates."""
     near: int = 0
-    """Candidates more, from around the best end: where runs ripple with a number, as with f."""
+    """Candidates more, from around the end of the smallest smoothed loss: runs may ripple with a number, as with f."""
     choosing_seeds: int = 48
     """Runs of each scene by which the best of the candidates is chosen."""
     held_out_seeds: int = 100

@@ -19,7 +19,7 @@ from vcjax.study.summary import mean_and_error
 from vcjax.tuning.choice import Choice, Setting
 from vcjax.tuning.landscape import as_grid, means
 from vcjax.tuning.losses import SHAPES
-from vcjax.tuning.tune import End, Tuned
+from vcjax.tuning.tune import End, Tuned, smoothest
 
 
 def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: Path) -> list[Path]:
@@ -28,7 +28,7 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
     `tune.json` is a `comparison` with the `history` of every descent, each step with its parameters, temperature,
     smoothed loss and gradient; how many runs there were, and starts, steps and pairs of runs that were left out; what
     was `wanted`, the weights of the objective; the `origin` of it all; and the `candidates`, setting before, ends of
-    the descents and what was tried near the best of them, each with its `name`, the `smoothed_loss` in the last quarter
+    the descents and what was tried near one of them, each with its `name`, the `smoothed_loss` in the last quarter
     of its descent and its `loss` on the seeds that chose, mean and standard error, null where that was not asked
     (`is_judged`).
 
@@ -161,7 +161,8 @@ def _candidates(tuned: Tuned) -> list[dict[str, Any]]:
     before, *near = (End(setting, math.nan, math.nan, True) for setting in (tuned.choice.before, *tuned.near))
     named = [("before", before)]
     named += [(f"end of descent {number}", end) for number, end in enumerate(tuned.ends, start=1)]
-    named += [(f"near the best end, {number}", end) for number, end in enumerate(near, start=1)]
+    place = f"near the end of descent {1 + smoothest(tuned.ends)}"
+    named += [(f"{place}, {number}", end) for number, end in enumerate(near, start=1)]
     return [
         {
             "name": name,
@@ -187,6 +188,8 @@ def _costs(compared: Mapping[str, Any]) -> str:
     if (num_judged := sum(end["is_judged"] for end in ends)) < len(ends):
         told += f", of the {num_judged} ends whose smoothed loss in the last quarter of the descent is the smallest"
     parameters = (f"`{path}`" for path in compared["before"]["parameters"])
+    if num_near := len(compared["candidates"]) - 1 - len(ends):
+        told += f"; with {num_near} from the neighbourhood of the end whose smoothed loss is the smallest"
     return f"{told}; bold the chosen one.\n\n{table(['candidate', *parameters, 'smoothed loss', 'loss'], rows)}"
 
 

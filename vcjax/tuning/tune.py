@@ -52,9 +52,9 @@ class Tuned(NamedTuple):
     ends: list[End]
     """Where each of them has led."""
     near: list[Setting]
-    """Candidates from around the end of the smallest smoothed loss."""
+    """Candidates from around the end of the smallest smoothed loss, see `smoothest`."""
     choice: Choice
-    """Where the parameters were, the best end of a descent, and what it is worth."""
+    """Where the parameters were, the best candidate, and what it is worth."""
     num_runs: int
     """Runs in the descents, each with its derivative."""
     origin: Mapping[str, Any]
@@ -108,7 +108,7 @@ def tune(
         num_near: further candidates, from around the end of the smallest smoothed loss: points of the neighbourhood
             over which its descent averaged, x + σz with z spread as a normal distribution (a Halton sequence). Where
             runs ripple with a parameter, that mean cannot say where in the neighbourhood it is best.
-        seeds: to choose the best end of a descent, and to compare it with the start.
+        seeds: to choose the best candidate, and to compare it with the start.
         key: base key.
         directory: where the work is kept, and looked for.
         progress: called with what was done last, and how much of how many steps or settings.
@@ -157,6 +157,8 @@ def tune(
                 if number == 0:
                     raise
             except ValueError as error:
+                if not history:
+                    raise
                 raise ValueError(f"{kept[number].path}: {error}") from None
             kept[number].write(None)
         left_out.append(start)
@@ -184,9 +186,16 @@ def _num_judged(num_descents: int) -> int:
     return min(num_descents, max(2, -(-num_descents // 2)))
 
 
+def smoothest(ends: Sequence[End]) -> int:
+    """Which of the ends has the smallest smoothed loss; NaN comes last."""
+    return int(np.argsort([end.smoothed_loss for end in ends], kind="stable")[0])
+
+
 def _near(problem: Problem, ends: Sequence[End], num: int) -> list[Setting]:
-    """Points of the neighbourhood of the best end."""
-    best = problem.to_free(ends[int(np.argsort([end.smoothed_loss for end in ends], kind="stable")[0])].setting)
+    """Points of the neighbourhood of the end of the smallest smoothed loss."""
+    if num == 0:
+        return []
+    best = problem.to_free(ends[smoothest(ends)].setting)
     spread = np.array([float(interval.spread) for interval in problem.intervals])
     z = norm.ppf(qmc.Halton(len(spread), scramble=False).random(num + 1)[1:])  # its first point is at infinity
     return [problem.to_parameters(best + spread * each) for each in z]
@@ -251,6 +260,8 @@ class _KeptSteps(NamedTuple):
         try:
             content = json.loads(self.path.read_text())
             found, steps = content["origin"] | {"start": content["start"]}, content["steps"]
+            if not isinstance(steps, list | None):
+                raise TypeError("steps are a list")
             steps = None if steps is None else [_step(step, self.start) for step in steps]
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise ValueError(f"{self.path}: no steps of a descent ({error}); remove it and run again.") from None
@@ -269,9 +280,9 @@ def _step(content: dict[str, Any], setting: Setting) -> Step:
     tables = (step.parameters, step.gradient, step.gradient_se, step.pathwise)
     if any(list(table) != list(setting) for table in tables):
         raise ValueError("a step of other parameters")
-    numbers = [step.temperature, step.loss, step.loss_se, step.num_failed]
-    if not all(isinstance(n, int | float) for n in (*numbers, *(n for table in tables for n in table.values()))):
-        raise TypeError("a step with something that is no number")
+    numbers = [step.temperature, step.loss, step.loss_se, *(n for table in tables for n in table.values())]
+    if not all(type(n) in (int, float) for n in numbers) or type(step.num_failed) is not int or step.num_failed < 0:
+        raise TypeError("a step with something that is no such number")
     return step
 
 
