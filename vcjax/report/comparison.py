@@ -34,9 +34,9 @@ Hard decisions, {seeds} seeds held out for each scene. Each cell: before → aft
 the difference, paired by seed; bold where it excludes zero. *F1* = 2 found / (found + static deleted + movers) counts
 the features deleted at least once, of the movers that were ever candidates or deleted; *recall at 1 % static* is the
 share of the movers found if the largest margin of each feature, of gate or detector, is compared with the threshold at
-which 1 % of the static ones are called dynamic (tracks of all runs pooled, bootstrap over seeds); *delay* counts the
-frames from the birth of a mover to its deletion, where it was found; *camera motion* is the mean square speed of the
-swing, (2πfA)²/2.
+which 1 % of the static ones are called dynamic (tracks of all runs pooled, bootstrap over 8 seeds or more); *delay*
+counts the frames from the birth of a mover to its deletion, where it was found; *camera motion* is the mean square
+speed of the swing, (2πfA)²/2.
 """
 _FAILED = """\
 **{before} seeds before and {after} after have a run that went non-finite in some scene**: they are in no mean over all
