@@ -74,10 +74,10 @@ def main(study: Study) -> None:
         axes = {path: np.linspace(i.low, i.high, study.points + 1)[1:] for path, i in intervals.items()}
     schedule = Schedule(num_steps=study.steps, pairs_per_step=study.pairs, learning_rate=study.learning_rate)
     config = vc.FilterConfig(gate=vc.VirtualCorrection(), smoothing="soft")
-    of_descents, of_grid = study.key, study.key if study.grid_key is None else study.grid_key
-    numbers = (3 * of_descents + 1, 3 * of_grid + 2, 3 * of_descents + 3)
+    of_grid = study.key if study.grid_key is None else study.grid_key
+    numbers = (3 * study.key + 1, 3 * of_grid + 2, 3 * study.key + 3)
     gradient_key, grid_key, held_out_key = map(jax.random.key, numbers)
-    gradient, grid = directory / f"gradient_{of_descents}", directory / f"grid_{of_grid}"
+    gradient, grid = directory / f"gradient_{study.key}", directory / f"grid_{of_grid}"
     tuned = tune(
         scenarios,
         config,
@@ -101,8 +101,8 @@ def main(study: Study) -> None:
         directory=grid,
         progress=lambda *done: print("grid:", *done, flush=True),
     )
-    both = directory / f"gradient_{of_descents}_against_grid_{of_grid}"
-    both /= choice_of(Path(), len(tuned.descents), study.near)
+    of_both = directory / f"gradient_{study.key}_against_grid_{of_grid}"
+    both = choice_of(of_both, len(tuned.descents), study.near)  # as the gradient's choice
     write_tuning(tuned, {}, gradient)
     write_search(found, grid)
     settings = {"before": found.before, "gradient": tuned.choice.after, "grid": found.after}

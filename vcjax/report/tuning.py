@@ -53,7 +53,9 @@ def write_tuning(tuned: Tuned, landscapes: Mapping[str, xr.Dataset], directory: 
         "starts_left_out": [dict(start) for start in tuned.left_out],
         "candidates": _candidates(tuned),
     }
-    title = f"# Tuned by gradient\n\n{_runs(compared)} {_left_out(tuned)}\n{_weights(compared)}\n{_costs(compared)}"
+    title = (
+        f"# Tuned by gradient\n\n{_runs(compared)} {_left_out(tuned)}\n{_weights(compared)}\n{_costs(compared, tuned)}"
+    )
     paths = _write(compared, title, directory / "tune")
     folder = directory / "figures"
     paths += write_figure(descent_figure(tuned.descents), folder / "descent")
@@ -175,9 +177,9 @@ def _candidates(tuned: Tuned) -> list[dict[str, Any]]:
     ]
 
 
-def _costs(compared: Mapping[str, Any]) -> str:
+def _costs(compared: Mapping[str, Any], tuned: Tuned) -> str:
     """The candidates as a table; bold what was chosen."""
-    rows, ends = [], [candidate for candidate in compared["candidates"] if candidate["name"].startswith("end")]
+    rows = []
     for candidate in compared["candidates"]:
         values, name = candidate["parameters"], candidate["name"]
         name = f"**{name}**" if values == compared["after"]["parameters"] else name
@@ -185,11 +187,11 @@ def _costs(compared: Mapping[str, Any]) -> str:
         rows.append([name, *(f"{value:.4g}" for value in values.values()), *costs])
     seeds = compared["origin"]["seeds"]["choosing"]
     told = f"Candidates, and their loss on the {seeds} seeds of each scene that chose, ± standard error"
-    if (num_judged := sum(end["is_judged"] for end in ends)) < len(ends):
+    if (num_judged := sum(end.is_judged for end in tuned.ends)) < len(tuned.ends):
         told += f", of the {num_judged} ends whose smoothed loss in the last quarter of the descent is the smallest"
+    if tuned.near:
+        told += f"; with {len(tuned.near)} from the neighbourhood of the end whose smoothed loss is the smallest"
     parameters = (f"`{path}`" for path in compared["before"]["parameters"])
-    if num_near := len(compared["candidates"]) - 1 - len(ends):
-        told += f"; with {num_near} from the neighbourhood of the end whose smoothed loss is the smallest"
     return f"{told}; bold the chosen one.\n\n{table(['candidate', *parameters, 'smoothed loss', 'loss'], rows)}"
 
 
