@@ -128,14 +128,14 @@ def test_equal_settings_do_not_differ_whatever_failed(choice, failed_before, fai
 
 
 def test_of_few_seeds_recall_has_no_interval(choice):
-    """Their resamples lie on one side of zero by chance: no interval, so nothing bold; of one no error either."""
+    """Their resamples lie on one side of zero by chance: no interval, so nothing bold, and no error."""
     for num, has_interval in ((1, False), (7, False), (8, True)):
         few = comparison(choice._replace(held_out=choice.held_out.isel(seed=slice(num))))
         for scene in SCENES:
             recall = few["paired"][scene][RECALL]
             assert recall["num_pairs"] == num and np.isfinite(recall["mean"])
             assert np.isfinite([recall["lower"], recall["upper"]]).all() == has_interval
-            assert np.isfinite(few["before"]["metrics"][scene][RECALL]["se"]) == (num > 1)
+            assert np.isfinite(few["before"]["metrics"][scene][RECALL]["se"]) == has_interval
 
 
 def test_recall_has_no_pairs_where_there_is_none(choice):
@@ -158,6 +158,15 @@ def test_figures_of_one_scene_have_their_titles_whole(choice):
         box = figure._suptitle.get_window_extent()
         assert box.x0 >= 0 and box.x1 <= figure.bbox.width
     assert "scenes" not in curves_figure(one)._suptitle.get_text()
+
+
+def test_curves_of_few_seeds_have_no_bands_nor_a_title_of_them(choice):
+    for num in (7, 8):
+        figure = curves_figure(choice._replace(held_out=choice.held_out.isel(seed=slice(num))))
+        bands = [band for axes in figure.axes for band in axes.collections]
+        drawn = [any(len(path.vertices) for path in band.get_paths()) for band in bands]
+        assert len(drawn) == 4 and all(is_drawn == (num == 8) for is_drawn in drawn)
+        assert ("bands" in figure._suptitle.get_text()) == (num == 8)
 
 
 def test_figures_tell_what_they_cannot_show(choice, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import numpy as np
 from vcjax.report.detection_roc import curves_markdown, curves_table, precision_figure, roc_figure
 from vcjax.study.detection_scores import Counts
 
-SEEDS = 5
+SEEDS = 8
 
 
 def made(found: int, flagged: int) -> Counts:

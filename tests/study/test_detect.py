@@ -252,11 +252,11 @@ def test_a_point_of_a_curve_has_the_interval_of_many_studies():
         assert 0.88 < np.mean(covered) < 0.99, name
     assert points[0]["found"] == found[0].sum() and points[0]["static"] == 40 * 90
     assert points[0]["precision"]["mean"] == pytest.approx(found[0].sum() / (found[0] + flagged[0]).sum())
-    never = operating_point(Counts(np.zeros(4), np.full(4, 6), np.zeros(4), np.full(4, 90)))
+    never = operating_point(Counts(np.zeros(8), np.full(8, 6), np.zeros(8), np.full(8, 90)))
     assert never["found_of_mapped_fraction"] == {"mean": 0.0, "lower": 0.0, "upper": 0.0}
     assert np.isnan(list(never["precision"].values())).all()
-    one = operating_point(Counts(*(np.array([number]) for number in (4, 6, 1, 90))))["precision"]
-    assert one["mean"] == 0.8 and np.isnan([one["lower"], one["upper"]]).all()
+    few = operating_point(Counts(*(np.full(7, number) for number in (4, 6, 1, 90))))["precision"]
+    assert few["mean"] == 0.8 and np.isnan([few["lower"], few["upper"]]).all()
 
 
 def test_counts_leave_failed_runs_out():

@@ -20,8 +20,6 @@ _DECIMALS = dict.fromkeys((*COMPARED, RECALL), 2) | {
     "orientation_error_deg": 3,
     "camera_motion_m2_s2": 3,
 }
-_MIN_PAIRS = 8
-"""Of fewer, resamples all lie on one side of zero by mere chance too often for an interval of 95 %."""
 _LABELS = COMPARED | {RECALL: "recall at 1 % static"}
 _TABLES = (
     ("detection_f1", RECALL, "position_rmse_cm"),
@@ -34,9 +32,9 @@ Hard decisions, {seeds} seeds held out for each scene. Each cell: before → aft
 the difference, paired by seed; bold where it excludes zero. *F1* = 2 found / (found + static deleted + movers) counts
 the features deleted at least once, of the movers that were ever candidates or deleted; *recall at 1 % static* is the
 share of the movers found if the largest margin of each feature, of gate or detector, is compared with the threshold at
-which 1 % of the static ones are called dynamic (tracks of all runs pooled, bootstrap over 8 seeds or more); *delay*
-counts the frames from the birth of a mover to its deletion, where it was found; *camera motion* is the mean square
-speed of the swing, (2πfA)²/2.
+which 1 % of the static ones are called dynamic (tracks of all runs pooled, bootstrap over {min_seeds} seeds
+or more); *delay* counts the frames from the birth of a mover to its deletion, where it was found; *camera motion* is
+the mean square speed of the swing, (2πfA)²/2.
 """
 _FAILED = """\
 **{before} seeds before and {after} after have a run that went non-finite in some scene**: they are in no mean over all
@@ -51,8 +49,8 @@ def comparison(choice: Choice) -> dict[str, Any]:
     run that failed in some scene, and so are in no mean over all scenes) and by scene, the last of which is all of
     them, `metrics`: each figure with `mean` and `se`. `paired` holds by scene and figure the `mean` of after -
     before, its 95 % interval `lower` to `upper`, and `num_pairs`: how many seeds count, which are those that
-    stayed finite and have the figure on both sides. Recall at 1 % static has its se by bootstrap, and from 8 pairs on
-    its interval; the others are Student-t.
+    stayed finite and have the figure on both sides. Recall at 1 % static has its se and interval by bootstrap, from
+    8 seeds on; the others are Student-t.
     """
     runs = [choice.held_out.isel(setting=i, drop=True) for i in (0, 1)]
     scenes, tracks = [by_scene(each) for each in runs], [tracks_of(each) for each in runs]
@@ -100,7 +98,7 @@ def comparison_markdown(compared: Mapping[str, Any]) -> str:
         [f"`{path}`", f"{value:.4g}", f"{after['parameters'][path]:.4g}"]
         for path, value in before["parameters"].items()
     ]
-    introduction = _INTRODUCTION.format(seeds=compared["held_out_seeds"])
+    introduction = _INTRODUCTION.format(seeds=compared["held_out_seeds"], min_seeds=roc.MIN_SEEDS)
     if before["seeds_failed"] or after["seeds_failed"]:
         introduction += _FAILED.format(before=before["seeds_failed"], after=after["seeds_failed"])
     sections = [grid(["parameter", "before", "after"], rows), introduction]
@@ -154,16 +152,12 @@ def _recall(tracks: roc.Tracks) -> tuple[float, np.ndarray]:
 
 
 def _recall_difference(tracks: Sequence[roc.Tracks], is_pair: np.ndarray) -> dict[str, Any]:
-    """After - before of the seeds that stayed finite in both, with its interval by the same resamples of them.
-
-    There is none of few seeds, see `_MIN_PAIRS`.
-    """
+    """After - before of the seeds that stayed finite in both, with its interval by the same resamples of them."""
     mean = lower = upper = math.nan
     if np.any(is_pair):
         before, after = (_recall(roc.Tracks(each.score[is_pair], each.is_mover[is_pair])) for each in tracks)
         mean = after[0] - before[0]
-        if np.sum(is_pair) >= _MIN_PAIRS:
-            lower, upper = map(float, roc.interval(after[1] - before[1]))
+        lower, upper = map(float, roc.interval(after[1] - before[1]))
     num = int(np.sum(is_pair)) if _is_finite(mean) else 0
     return {"mean": mean, "lower": lower, "upper": upper, "num_pairs": num}
 

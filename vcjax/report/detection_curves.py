@@ -18,7 +18,7 @@ _RESAMPLES = 300
 
 @matplotlib.rc_context(RC)
 def curves_figure(choice: Choice) -> Figure:
-    """Both curves over the tracks of all scenes and held-out seeds, with pointwise 95 % bands by bootstrap."""
+    """Both curves over the tracks of all scenes and held-out seeds; from 8 seeds on with pointwise 95 % bands."""
     figure = new_figure(7.2, 3.6)
     left, right = figure.subplots(1, 2)
     for tracks, (side, style) in zip(_tracks(choice), _STYLES.items(), strict=True):
@@ -28,7 +28,7 @@ def curves_figure(choice: Choice) -> Figure:
     precision_axes(right)
     seeds, scenes = choice.held_out.sizes["seed"], choice.held_out.sizes["scene"]
     of = f"{scenes} scenes × {seeds}" if scenes > 1 else str(seeds)
-    _finish(figure, left, f"Tracks of {of} held-out runs, 95 % bands")
+    _finish(figure, left, f"Tracks of {of} held-out runs{_bands(seeds)}")
     return figure
 
 
@@ -49,10 +49,15 @@ def roc_by_scene_figure(choice: Choice) -> Figure:
         roc_axes(axes)
         axes.set_title(name)
         axes.label_outer()
-    title = f"ROC over the tracks of {choice.held_out.sizes['seed']} held-out runs, 95 % bands"
+    seeds = choice.held_out.sizes["seed"]
+    title = f"ROC over the tracks of {seeds} held-out runs{_bands(seeds)}"
     # A figure of one panel is narrower than its title.
     _finish(figure, panels[0, 0], title if columns > 1 else title.replace(" of ", "\nof "))
     return figure
+
+
+def _bands(seeds: int) -> str:
+    return ", 95 % bands" if seeds >= roc.MIN_SEEDS else ""
 
 
 def _tracks(choice: Choice) -> list[dict[str, roc.Tracks]]:
@@ -60,7 +65,7 @@ def _tracks(choice: Choice) -> list[dict[str, roc.Tracks]]:
 
 
 def draw_curve(axes: Axes, levels: np.ndarray, curve, tracks: roc.Tracks, label: str, style: dict) -> None:
-    """`roc.recall_at` or `precision_at` with its pointwise 95 % band by bootstrap over seeds; a word where none is."""
+    """`roc.recall_at` or `precision_at` with its pointwise 95 % band, where seeds suffice; a word where no curve is."""
     if np.all(np.isnan(curve(tracks, levels)[0])):
         axes.plot([], [], label=label, **style)
         height = 0.5 - 0.1 * len(axes.texts)

@@ -10,13 +10,14 @@ from matplotlib.figure import Figure
 
 from vcjax.report.markup import grid
 from vcjax.report.style import METHOD_STYLES, RC, new_figure
+from vcjax.study import roc
 from vcjax.study.detection_methods import METHODS
 from vcjax.study.operating_curves import Curves, operating_point
 
 _INTRODUCTION = """\
 Each line is of runs at that threshold, all scenes with movers together but the harder ones: static features flagged of
 those ever mapped, movers found of those ever mapped, and movers among all that was flagged, with 95 % intervals by
-bootstrap over seeds. Bold: the method's own threshold.
+bootstrap over {min_seeds} seeds or more. Bold: the method's own threshold.
 """
 _RESOLVED = 1e-3
 """Share of the static features above which the axis is logarithmic; below, down to none, it is linear."""
@@ -54,7 +55,7 @@ def curves_markdown(table: Sequence[Mapping[str, Any]]) -> str:
         if line["amplitude_m"] == amplitude
         for point in line["points"]
     ]
-    return _INTRODUCTION + "\n" + grid(header, rows)
+    return _INTRODUCTION.format(min_seeds=roc.MIN_SEEDS) + "\n" + grid(header, rows)
 
 
 @matplotlib.rc_context(RC)

@@ -27,8 +27,8 @@ def operating_point(counts: Counts) -> dict[str, Any]:
 
     Returns: `static_flagged_fraction`, of the static features ever mapped; `found_of_mapped_fraction`, of the movers
         ever mapped: recall; `precision`, movers among what was flagged; each with `mean`, `lower` and `upper`, NaN
-        where there is nothing to count, in the interval if that is so in any resample or there is but one seed. And
-        the sums of `Counts`.
+        where there is nothing to count, in the interval if that is so in any resample or there are fewer seeds than
+        `roc.MIN_SEEDS`. And the sums of `Counts`.
     """
     flagged = counts.found + counts.flagged
     return {
@@ -43,6 +43,6 @@ def _share(part: np.ndarray, whole: np.ndarray) -> dict[str, float]:
     """Σ part / Σ whole over the seeds."""
     weights = roc.resamples(len(whole))
     with np.errstate(invalid="ignore"):
-        shares = weights @ part / (weights @ whole) if len(whole) > 1 else np.full(len(weights), np.nan)
+        shares = weights @ part / (weights @ whole) if len(whole) >= roc.MIN_SEEDS else np.full(len(weights), np.nan)
         lower, upper = roc.interval(shares)
         return {"mean": float(np.divide(part.sum(), whole.sum())), "lower": float(lower), "upper": float(upper)}

@@ -22,6 +22,8 @@ FALSE_RATES = np.geomspace(1e-3, 1.0, 61)
 RECALLS = np.linspace(0.02, 1.0, 50)
 """Shares of the movers found at which curves are given."""
 NUM_RESAMPLES = 1000
+MIN_SEEDS = 8
+"""Of fewer, resamples all lie on one side of a value by mere chance too often for an interval of 95 %."""
 _CONFIDENCE = 0.95
 
 
@@ -127,8 +129,8 @@ def area(tracks: Tracks, weights: Float[np.ndarray, "b seed"] | None = None) -> 
 def resampled(
     curve: Callable[..., np.ndarray], tracks: Tracks, levels: Float[np.ndarray, " r"], num: int = NUM_RESAMPLES
 ) -> Float[np.ndarray, "b r"]:
-    """`recall_at` or `precision_at` of every resample; NaN of a single seed, which says nothing of others."""
-    if len(tracks.score) < 2:
+    """`recall_at` or `precision_at` of every resample; NaN of fewer than `MIN_SEEDS` seeds."""
+    if len(tracks.score) < MIN_SEEDS:
         return np.full((num, len(levels)), np.nan)
     # A few at a time, which bounds the memory.
     weights = resamples(len(tracks.score), num)
