@@ -189,11 +189,11 @@ assert deleted[:2].min() > 10 > 1 > deleted[4:].max()
 # %% [markdown]
 # ## 3. Down by gradient
 #
-# A grid of two numbers is cheap enough; a grid of four is not, and a gradient costs about as much for four numbers as
-# for two. `tune` goes down it step by step. It starts where a textbook would: at 5.99, which 95 % of the squared
-# distances of a fitting measurement stay below. Each of the eight steps averages two pairs of runs in each scene, 64
-# runs in all; then the end is compared with the start, first to choose between the two, and then on seeds that nothing
-# has seen.
+# A grid of two numbers is cheap enough; a grid of four is not, and a gradient costs less than twice as much for four
+# numbers as for two. `tune` goes down it step by step. It starts where a textbook would: at 5.99, which 95 % of the
+# squared distances of a fitting measurement stay below. Each of the eight steps averages two pairs of runs in each
+# scene, 64 runs in all; then the end is compared with the start, first to choose between the two, and then on seeds
+# that nothing has seen.
 
 # %%
 schedule = Schedule(num_steps=8, pairs_per_step=2)

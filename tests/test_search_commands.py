@@ -129,7 +129,13 @@ def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
         (["sweep", "--y-range", "0", "1"], ["--y-range 0 1", "positive"]),
         (["sweep", "--y-points", "1"], ["--y-points 1", "at least two"]),
         (["sweep", "--x-points", "100000"], ["--x-points 100000", "at most 200"]),
-        (["sweep", "--x", "config.temperature"], ["config.temperature", "no effect"]),
+        (["sweep", "--x", "config.temperature", "--x-range", "1", "2"], ["config.temperature", "no effect"]),
+        (
+            ["sweep", "--x", "scenario.oscillation.amplitude_m"],
+            ["amplitude_m: give --x-range"],
+        ),
+        (["sweep", "--speeds-m-s", "0", "1"], ["'lateral, 0 m/s'", "nothing moves there", "track_f1 is the same"]),
+        (["tune", "thresholds", "--speeds-m-s", "0", "1"], ["nothing moves there", "track_cross_entropy"]),
         (["sweep", "--seeds", "0"], ["choosing=0"]),
         (
             ["sweep", "--y", "scenario.oscillation.frequency_hz", "--y-range", "1", "9"],

@@ -39,6 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Bad input gives one line on standard error and status 1, not a traceback. What is wrong with the command line itself
     the parser says, in a box, and exits with status 2.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # where a terminal's encoding lacks a sign, a question mark will do
     console = Console(stderr=True)
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     try:

@@ -69,7 +69,7 @@ def test_means_and_paired_intervals_are_those_of_scipy(choice):
     for name in COMPARED:
         for scene in (*SCENES, ALL):
             runs = choice.held_out[name]
-            runs = runs.mean("scene") if scene == ALL else runs.sel(scene=scene)
+            runs = runs.mean("scene", skipna=False) if scene == ALL else runs.sel(scene=scene)
             before, after = (runs.sel(setting=i).values for i in (0, 1))
             found = compared["after"]["metrics"][scene][name]
             np.testing.assert_allclose(found["mean"], np.nanmean(after), rtol=1e-12)
@@ -198,6 +198,27 @@ def test_one_scene_stands_for_all_and_a_setting_that_stays_is_told(choice):
     assert f"| {SCENES[0]} |" in text and f"| {ALL} |" not in text and "No candidate" not in text
     stays = comparison_markdown(comparison(choice._replace(after=choice.before)))
     assert "No candidate is better than the setting before" in stays
+
+
+def test_a_choice_that_is_not_surely_better_on_other_seeds_is_told(choice):
+    loss = choice.held_out.loss
+    rng = np.random.default_rng(0)
+    for rise, words in ((-0.2, None), (0.0, "is not surely smaller after than before"), (0.2, "is larger after than")):
+        after = loss[0] + rise + rng.normal(0.0, 0.1, loss[0].shape)
+        held_out = choice.held_out.assign(loss=loss.copy(data=np.stack([loss[0], after])))
+        text = comparison_markdown(comparison(choice._replace(held_out=held_out)))
+        assert ("On the seeds held out the objective" in text) == (words is not None) and (words or "") in text
+
+
+def test_one_seed_is_called_one(choice):
+    one = comparison_markdown(comparison(choice._replace(held_out=choice.held_out.isel(seed=[0]))))
+    assert "Hard decisions, 1 seed held out" in one
+
+
+def test_a_mark_outside_of_the_grid_is_said_to_be_there(choice):
+    for th1, label in ((9.0, "before"), (9e3, "before: outside")):
+        figure = landscape_figure(as_grid(choice), "title", {"before": choice.before | {TH1: th1}})
+        assert [text.get_text() for text in figure.legends[0].get_texts()] == [label]
 
 
 def test_search_and_tuning_are_written_whole(choice, tmp_path):

@@ -73,6 +73,24 @@ def test_a_seed_that_failed_in_one_scene_is_in_no_mean_over_all(found):
     assert not np.isnan(tracks["1.0 m/s"].score[2]).all() and not np.isnan(scenes["1.0 m/s"].loss[2])
 
 
+def test_means_over_all_scenes_are_of_the_same_scenes(found):
+    """Delays: where no mover is found in a scene in one run, the mean of the others would be of other scenes."""
+    first, second = SCENES
+    runs = found.held_out.copy(deep=True)
+    delay = runs.detection_delay_frames
+    delay[:] = 10.0
+    delay.loc[{"scene": second}] = 50.0
+    delay.loc[{"scene": second, "setting": 0, "seed": 1}] = np.nan
+    of_all = by_scene(runs)[ALL].detection_delay_frames
+    np.testing.assert_array_equal(of_all, [[30.0, np.nan, 30.0], [30.0, 30.0, 30.0]])
+    delay.loc[{"scene": second, "setting": 0}] = np.nan
+    assert np.isnan(by_scene(runs)[ALL].detection_delay_frames[0]).all()
+    # A scene that no run has a figure of, such as one without movers, is not asked for one.
+    delay.loc[{"scene": second}] = np.nan
+    np.testing.assert_array_equal(by_scene(runs)[ALL].detection_delay_frames, np.full((2, 3), 10.0))
+    np.testing.assert_array_equal(by_scene(runs)[first].detection_delay_frames, np.full((2, 3), 10.0))
+
+
 def test_means_of_a_grid_do_not_skip_a_run_that_failed(found):
     grid = as_grid(found._replace(candidates=with_failed_run(found.candidates, setting=1, scene="1.0 m/s", seed=0)))
     expected, points = means(as_grid(found)), means(grid)
@@ -126,6 +144,16 @@ def test_bad_searches_are_refused(unchecked):
             search(SCENES, SOFT, axes, seeds=seeds, key=KEY)
     with pytest.raises(ValueError, match=r"settings\(scenarios=<list>\): give at least one scene"):
         search([tiny_runs.scenario()] * 2, SOFT, {TH1: [1.0], TH2: [1.0]}, key=KEY)
+    rest = {"objective": OBJECTIVE, "seeds": SEEDS, "key": KEY}
+    for candidates in ([], [{TH1: 1.0}, {TH2: 1.0}], [1.0], "best"):
+        with pytest.raises(ValueError, match=r"choose\(candidates=.*: give at least one setting, a mapping"):
+            choose(SCENES, SOFT, candidates, **rest)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"choose\(directory=3"):
+        choose(SCENES, SOFT, [{TH1: 1.0}], directory=3, **rest)  # pyright: ignore[reportArgumentType]
+    for name in (1, True, ALL):
+        scenes = {name: tiny_runs.scenario()}
+        with pytest.raises(ValueError, match=rf"scenarios\[{name!r}\]: give each scene a name, a text other than"):
+            search(scenes, SOFT, {TH1: [1.0], TH2: [1.0]}, key=KEY)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"Seeds\(choosing=0\): give a whole number of at least 1"):
         Seeds(0, 3)
     with pytest.raises(ValueError, match=r"Seeds\(held_out=0\)"):

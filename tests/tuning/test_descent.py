@@ -22,6 +22,9 @@ KEY = jax.random.key(3)
 SCENES = {
     f"{v} m/s": tiny_runs.scenario(oscillation_amplitude_m=0.05, dynamic_speed_m_s=v, num_frames=8) for v in (0.5, 1.0)
 }
+STATIC = {
+    "static": tiny_runs.scenario(oscillation_amplitude_m=0.05, dynamic="lateral", dynamic_speed_m_s=0.0, num_frames=8)
+}
 SOFT = tiny_runs.config(tiny_runs.STRICT, smoothing="soft")
 TH1, A, F = "config.gate.th1", *OSCILLATION
 PARAMETERS = {TH1: Interval(0.2, 50.0, is_log=True), **OSCILLATION}
@@ -232,6 +235,12 @@ def test_bad_problems_are_refused(unchecked):
             r"from -1 to 4: FilterConfig\(pixel_std_px=-1.0",
         ),
         ({"parameters": {"config.temperature": Interval(1.0, 4.0)}}, "the schedule sets it"),
+        (
+            {"parameters": {F: Interval(1.0, 4.5), "scenario.frame_rate_hz": Interval(6.5, 20.0)}},
+            r"where scenario.oscillation.frequency_hz = 4.5, scenario.frame_rate_hz = 6.5: .*not below half the frame",
+        ),
+        ({"scenarios": SCENES | STATIC}, r"scenarios\['static'\]\): nothing moves there"),
+        ({"scenarios": {"all scenes": tiny_runs.scenario()}}, "give each scene a name, a text other than 'all scenes'"),
         ({"parameters": {A: Interval(0.0, 3.0)}}, r"from 0 to 3: A is a swing of the camera, between 0 and 0.5 m"),
     ):
         given = {"scenarios": SCENES, "config": SOFT, "parameters": PARAMETERS} | arguments
@@ -251,6 +260,14 @@ def test_bad_problems_are_refused(unchecked):
     ):
         with pytest.raises(ValueError, match=message):
             make()
+
+
+def test_a_scene_without_movers_serves_what_static_features_cost():
+    for wanted in ({"track_cross_entropy": 1.0}, {"position": 1.0}, {"consistency": 1.0}):
+        problem_of(SCENES | STATIC, SOFT, PARAMETERS, Objective(**({"track_f1": 0.0} | wanted)))
+    for wanted in ("candidate_f1", "track_ranking"):
+        with pytest.raises(ValueError, match=f"so that {wanted} is the same"):
+            problem_of(STATIC, SOFT, PARAMETERS, Objective(**({"track_f1": 0.0, "position": 1.0} | {wanted: 1.0})))
 
 
 def test_an_end_may_be_the_last_number_that_is_valid():

@@ -53,6 +53,13 @@ def test_figures_are_those_of_monte_carlo(runs):
         np.testing.assert_allclose(found.camera_motion_m2_s2, motion, rtol=1e-6)
 
 
+def test_who_moves_is_told_of_each_setting():
+    """Of a speed that is swept from 0 on it is not the same in all."""
+    scenes = {"lateral": SCENES["0.5 m/s"]}
+    found = evaluate(scenes, CONFIG, {"scenario.movers.speed_m_s": [0.0, 0.5]}, num_seeds=1, key=KEY)
+    assert found.is_moving.any("feature").squeeze().values.tolist() == [False, True]
+
+
 def test_decisions_are_hard_whatever_the_configuration_says(runs):
     soft = dataclasses.replace(CONFIG, smoothing="soft")
     xr.testing.assert_identical(evaluate(SCENES, soft, SETTINGS, objective=OBJECTIVE, num_seeds=2, key=KEY), runs)

@@ -63,6 +63,6 @@ class Detect:
                 progress=show,
             )
         paths = write_detection(found, self.out)
-        print((self.out / "detect.md").read_text())
+        print((self.out / "detect.md").read_text("utf-8"))
         for path in paths:
             say(console, f"wrote {path}")

@@ -108,6 +108,6 @@ class Detectability:
                 best=best_oscillation(next(iter(scenes.values())), self.test, price=self.price),
             )
         paths = write_detectability(found, self.out)
-        print((self.out / "detectability.md").read_text())
+        print((self.out / "detectability.md").read_text("utf-8"))
         for path in paths:
             say(console, f"wrote {path}")

@@ -11,11 +11,13 @@ from vcjax.devices import Cores
 from vcjax.filter.config import FilterConfig
 from vcjax.gates.virtual_correction import VirtualCorrection
 from vcjax.report.tuning import check_places, write_search
-from vcjax.tuning.choice import Seeds
+from vcjax.tuning.choice import Seeds, setting_of
 from vcjax.tuning.landscape import search
 from vcjax.tuning.losses import WANTED, Objective
 from vcjax.tuning.scenes import Scenes
 
+_RANGES = {"config.gate.th1": (2.0, 64.0), "config.gate.th2": (0.5, 64.0)}
+"""From where to where, unless it is said."""
 _MAX_POINTS = 200
 """Along one axis: a grid of twice as many each way takes days, and its heat map shows no more."""
 
@@ -29,15 +31,15 @@ class Sweep:
 
     x: str = "config.gate.th1"
     """First number, by its path, e.g. config.gate.th1, config.pixel_std_px, scenario.oscillation.amplitude_m."""
-    x_range: tuple[float, float] = (2.0, 64.0)
-    """From where to where."""
+    x_range: tuple[float, float] | None = None
+    """From where to where; of Th1 and Th2 2 to 64 and 0.5 to 64 if it is not said, of others it has to be."""
     x_points: int = 12
     """How many values."""
     x_log: bool = True
     """Equal factors between them instead of equal steps."""
     y: str = "config.gate.th2"
     """Second number."""
-    y_range: tuple[float, float] = (0.5, 64.0)
+    y_range: tuple[float, float] | None = None
     """From where to where."""
     y_points: int = 12
     """How many values."""
@@ -66,16 +68,18 @@ class Sweep:
         """Run, draw, report."""
         if self.x == self.y:
             raise ValueError(f"--x {self.x} --y {self.y}: give two numbers.")
-        axes = {
-            self.x: _values("x", self.x_range, self.x_points, self.x_log),
-            self.y: _values("y", self.y_range, self.y_points, self.y_log),
-        }
         scenarios, key = self.scenes.make(), numbered_key(self.key)
+        config = FilterConfig(gate=VirtualCorrection(th1=self.th1, th2=self.th2))
+        setting_of(scenarios, config, (self.x, self.y))  # there are such numbers
+        axes = {
+            self.x: _values("x", self.x, self.x_range, self.x_points, self.x_log),
+            self.y: _values("y", self.y, self.y_range, self.y_points, self.y_log),
+        }
         check_places(self.out, "sweep")
         with progress_bar(console, "compiling, first block") as show:
             choice = search(
                 scenarios,
-                FilterConfig(gate=VirtualCorrection(th1=self.th1, th2=self.th2)),
+                config,
                 axes,
                 objective=self.objective,
                 seeds=Seeds(self.seeds, self.held_out_seeds),
@@ -84,17 +88,20 @@ class Sweep:
                 progress=lambda name, done, total: show(done, total, name),
             )
         paths = write_search(choice, self.out)
-        print((self.out / "sweep.md").read_text())
+        print((self.out / "sweep.md").read_text("utf-8"))
         for path in paths:
             say(console, f"wrote {path}")
 
 
-def _values(axis: str, ends: tuple[float, float], num: int, is_log: bool) -> np.ndarray:
+def _values(axis: str, path: str, ends: tuple[float, float] | None, num: int, is_log: bool) -> np.ndarray:
     """The values along an axis.
 
     Raises:
         ValueError: for ends or a number of points that give none.
     """
+    ends = _RANGES.get(path) if ends is None else ends
+    if ends is None:
+        raise ValueError(f"--{axis} {path}: give --{axis}-range, from where to where.")
     low, high = ends
     if not (np.isfinite(low) and np.isfinite(high) and low < high and (low > 0 or not is_log)):
         raise ValueError(f"--{axis}-range {low:g} {high:g}: give two rising numbers, positive ones with --{axis}-log.")

@@ -119,7 +119,7 @@ class Tune:
                 if self.landscape_points > 0
             }
         paths = write_tuning(tuned, landscapes, directory)
-        print((directory / "tune.md").read_text())
+        print((directory / "tune.md").read_text("utf-8"))
         for path in paths:
             say(console, f"wrote {path}")
 

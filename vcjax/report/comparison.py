@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from vcjax.report.markup import grid
+from vcjax.report.markup import counted, grid
 from vcjax.study import roc
 from vcjax.study.summary import mean_and_error, student_t
 from vcjax.tuning.choice import ALL, COMPARED, FALSE_RATE, RECALL, Choice, by_scene, tracks_of
@@ -28,13 +28,13 @@ _TABLES = (
     ("loss", "camera_motion_m2_s2"),
 )
 _INTRODUCTION = """\
-Hard decisions, {seeds} seeds held out for each scene. Each cell: before → after, and in brackets the 95 % interval of
+Hard decisions, {seeds} held out for each scene. Each cell: before → after, and in brackets the 95 % interval of
 the difference, paired by seed; bold where it excludes zero. *F1* = 2 found / (found + static deleted + movers) counts
 the features deleted at least once, of the movers that were ever candidates or deleted; *recall at 1 % static* is the
 share of the movers found if the largest margin of each feature, of gate or detector, is compared with the threshold at
-which 1 % of the static ones are called dynamic (tracks of all runs pooled, bootstrap over {min_seeds} seeds
-or more); *delay* counts the frames from the birth of a mover to its deletion, where it was found; *camera motion* is
-the mean square speed of the swing, (2πfA)²/2.
+which 1 % of the static ones are called dynamic (tracks of all runs pooled, intervals by bootstrap, from
+{min_seeds} seeds on); *delay* counts the frames from the birth of a mover to its deletion, where it was found, over all
+scenes of the seeds that have one in each; *camera motion* is the mean square speed of the swing, (2πfA)²/2.
 """
 _FAILED = """\
 **{before} seeds before and {after} after have a run that went non-finite in some scene**: they are in no mean over all
@@ -53,7 +53,10 @@ def comparison(choice: Choice) -> dict[str, Any]:
     8 seeds on; the others are Student-t.
     """
     runs = [choice.held_out.isel(setting=i, drop=True) for i in (0, 1)]
-    scenes, tracks = [by_scene(each) for each in runs], [tracks_of(each) for each in runs]
+    # Of both together, so that means over all scenes are of the same scenes.
+    of_both = by_scene(choice.held_out)
+    scenes = [{name: each.isel(setting=i, drop=True) for name, each in of_both.items()} for i in (0, 1)]
+    tracks = [tracks_of(each) for each in runs]
     in_both = choice.held_out.is_finite.all("setting")
     metrics: list[dict[str, Any]] = [{}, {}]
     paired: dict[str, Any] = {}
@@ -98,12 +101,16 @@ def comparison_markdown(compared: Mapping[str, Any]) -> str:
         [f"`{path}`", f"{value:.4g}", f"{after['parameters'][path]:.4g}"]
         for path, value in before["parameters"].items()
     ]
-    introduction = _INTRODUCTION.format(seeds=compared["held_out_seeds"], min_seeds=roc.MIN_SEEDS)
+    introduction = _INTRODUCTION.format(seeds=counted(compared["held_out_seeds"], "seed"), min_seeds=roc.MIN_SEEDS)
     if before["seeds_failed"] or after["seeds_failed"]:
         introduction += _FAILED.format(before=before["seeds_failed"], after=after["seeds_failed"])
     sections = [grid(["parameter", "before", "after"], rows), introduction]
     if before["parameters"] == after["parameters"]:
         sections.insert(1, "No candidate is better than the setting before, which stays.\n")
+    elif not (difference := list(compared["paired"].values())[-1]["loss"])["upper"] < 0:
+        means = " → ".join(f"{compared[side]['loss']['mean']:.3f}" for side in ("before", "after"))
+        judgement = "larger" if difference["lower"] > 0 else "not surely smaller"
+        sections.insert(1, f"**On the seeds held out the objective is {judgement} after than before: {means}.**\n")
     scenes = [name for name in compared["paired"] if name != ALL or len(compared["paired"]) > 2]
     for figures in _TABLES:
         rows = [[scene, *(_cell(compared, scene, figure) for figure in figures)] for scene in scenes]

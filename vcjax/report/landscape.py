@@ -48,6 +48,7 @@ def landscape_figure(
     figure = new_figure(8.6, 6.6)
     panels = figure.subplots(2, 2, sharex=True, sharey=True)
     shown, edges = means(grid), (_edges(grid[x].values), _edges(grid[y].values))
+    limits = [each[[0, -1]] for each in edges]
     for axes, (name, (label, colours)) in zip(panels.flat, PANELS.items(), strict=True):
         values = shown[name].transpose(y, x)
         image = axes.pcolormesh(*edges, values, cmap=colours, shading="flat", rasterized=True)
@@ -68,7 +69,9 @@ def landscape_figure(
             )
         # One setting may be another: then the mark of the first is seen around that of the second.
         for (mark, setting), symbol, size in zip((marks or {}).items(), "os^D", (12, 8, 8, 8), strict=False):
-            style = {"color": "#d55e00", "markeredgecolor": "white", "markersize": size, "label": mark}
+            is_inside = all(low <= setting[p] <= high for p, (low, high) in zip((x, y), limits, strict=True))
+            label = mark if is_inside else f"{mark}: outside"
+            style = {"color": "#d55e00", "markeredgecolor": "white", "markersize": size, "label": label}
             axes.plot(setting[x], setting[y], symbol, **style)
         axes.label_outer()
     handles, labels = panels[0, 0].get_legend_handles_labels()

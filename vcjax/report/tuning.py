@@ -11,6 +11,7 @@ from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.descent import descent_figure
 from vcjax.report.detection_curves import curves_figure, roc_by_scene_figure
 from vcjax.report.landscape import landscape_figure
+from vcjax.report.markup import counted
 from vcjax.report.markup import grid as table
 from vcjax.report.style import write_figure
 from vcjax.storage import check_writable, write_file, write_json
@@ -185,8 +186,8 @@ def _costs(compared: Mapping[str, Any], tuned: Tuned) -> str:
         name = f"**{name}**" if values == compared["after"]["parameters"] else name
         costs = (_with_error(candidate[each]) for each in ("smoothed_loss", "loss"))
         rows.append([name, *(f"{value:.4g}" for value in values.values()), *costs])
-    seeds = compared["origin"]["seeds"]["choosing"]
-    told = f"Candidates, and their loss on the {seeds} seeds of each scene that chose, ± standard error"
+    seeds = counted(compared["origin"]["seeds"]["choosing"], "seed")
+    told = f"Candidates, and their loss on {seeds} of each scene that chose, ± standard error"
     if (num_judged := sum(end.is_judged for end in tuned.ends)) < len(tuned.ends):
         told += f", of the {num_judged} ends whose smoothed loss in the last quarter of the descent is the smallest"
     if tuned.near:

@@ -238,7 +238,7 @@ def read_ratios(baseline: Path) -> dict[str, float]:
         OSError: if it cannot be read.
     """
     try:
-        found = json.loads(baseline.read_text())
+        found = json.loads(baseline.read_text("utf-8"))
         accepted = {name: found[name] for name in RATIOS if found.get(name) is not None}
     except (ValueError, AttributeError) as error:
         raise ValueError(f"{baseline}: no numbers of `vcjax bench --json` ({error!r}).") from None

@@ -19,8 +19,8 @@ from vcjax.simulation.scenarios import Scenario
 from vcjax.study import roc
 from vcjax.study.results import describe, provenance
 from vcjax.study.sweep import Experiment, number_at, require_paths
-from vcjax.tuning.blocks import check_blocks, hard
-from vcjax.tuning.evaluate import evaluate, stacked
+from vcjax.tuning.blocks import as_directory, check_blocks, hard
+from vcjax.tuning.evaluate import ALL, evaluate, stacked
 from vcjax.tuning.losses import Objective
 
 Setting = dict[str, float]
@@ -42,7 +42,6 @@ COMPARED = {
 """Figures in which settings are compared, and their labels."""
 RECALL = "recall_at_1_percent_static"
 """Share of the movers found at `FALSE_RATE`."""
-ALL = "all scenes"
 
 
 class Choice(NamedTuple):
@@ -81,7 +80,7 @@ def choose(
     objective: Objective,
     seeds: Seeds,
     key: PRNGKeyArray,
-    directory: Path | None = None,
+    directory: str | Path | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Choice:
     """Run all candidates, take the best, and run it and the first of them on seeds held out.
@@ -89,7 +88,7 @@ def choose(
     Args:
         scenarios: scenes by name.
         config: the filter; it decides hard.
-        candidates: settings of the same paths, the first of them the one to compare with.
+        candidates: settings of the same paths, at least one, the first of them the one to compare with.
         objective: what is to be small.
         seeds: how many.
         key: base key. The seeds held out depend on it alone, and not on the candidates.
@@ -97,11 +96,14 @@ def choose(
         progress: called with what is done, and how many settings of how many.
 
     Raises:
-        ValueError: as `evaluate`, or if every candidate has a run that is not finite.
+        ValueError: as `evaluate`, for candidates that are no such settings, or if every one has a run that is not
+            finite.
     """
+    _require_settings(candidates)
     require_key("choose", key)
     require_kind("choose", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=48, held_out=100).")
     (_, choosing_key), (_, held_out_key) = _kinds(seeds, key)
+    directory = as_directory("choose", directory)
     if directory is not None:
         check_directory(directory, scenarios, config, len(candidates), objective=objective, seeds=seeds, key=key)
 
@@ -162,6 +164,18 @@ def check_directory(
         check_blocks(directory / name, scenarios, config, None, num, **given)
 
 
+def _require_settings(candidates: Sequence[Setting]) -> None:
+    """Refuse candidates that cannot be compared.
+
+    Raises:
+        ValueError: unless they are settings of the same paths, at least one.
+    """
+    remedy = "give at least one setting, a mapping of paths to numbers; all of the same paths."
+    require_kind("choose", "candidates", candidates, Sequence, remedy)
+    if not candidates or not all(isinstance(each, Mapping) and set(each) == set(candidates[0]) for each in candidates):
+        raise ValueError(f"choose(candidates={list(candidates)!r:.200}): {remedy}")
+
+
 def _kinds(seeds: Seeds, key: PRNGKeyArray) -> tuple[tuple[int, PRNGKeyArray], tuple[int, PRNGKeyArray]]:
     """Number and base key of the seeds that choose, and of those held out."""
     choosing_key, held_out_key = jax.random.split(key)
@@ -188,18 +202,22 @@ def setting_of(scenarios: Mapping[str, Scenario], config: FilterConfig, paths: S
 
 
 def by_scene(runs: Any) -> dict[str, Any]:
-    """Runs of one setting for each scene, and over all scenes (see `over_scenes`)."""
+    """Runs for each scene, and over all scenes (see `over_scenes`)."""
     names = [str(name) for name in runs.scene.values]
     scenes = {name: runs.sel(scene=name)[list(COMPARED)] for name in names}
     return scenes | {ALL: over_scenes(runs)}
 
 
 def over_scenes(runs: Any) -> Any:
-    """Every seed's figures over all scenes: means of the scenes that have the figure.
+    """Every seed's figures over all scenes: means of the scenes in which any of the runs has the figure.
 
-    A seed whose run failed in any scene has none: the mean of the other scenes would flatter it.
+    A seed that lacks it in one of these has no mean, as where a run failed or, of delays, no mover was found: the mean
+    of the other scenes would compare them with all.
     """
-    return runs[list(COMPARED)].mean("scene").where(runs.is_finite.all("scene"))
+    figures = runs[list(COMPARED)]
+    has = figures.notnull()
+    is_asked = has.any([dim for dim in has.dims if dim != "scene"])
+    return figures.mean("scene").where((has | ~is_asked).all("scene") & runs.is_finite.all("scene"))
 
 
 def tracks_of(runs: Any) -> dict[str, roc.Tracks]:

@@ -5,11 +5,11 @@ its gradient over a mini-batch of seeds, new in every step, and over all scenes.
 units of its standard errors, (∂L/∂xᵢ)/sᵢ: not how much a parameter matters, but how sure it is which way it has to go,
 so that one whose gradient is mostly noise neither hides the others nor is moved far. A step is as long as the learning
 rate where this is sure, and shorter where it is less so: its norm counts up to √2 errors in each parameter, so that
-nothing but noise moves it by 0.6 of the learning rate where the errors are known from many pairs, and by up to 0.8
-where they are known from two, in no direction in particular. The learning rate falls by a cosine. (Units that an
-optimiser learns from earlier gradients are those of the first, steep ones, and too large where it has to settle;
-Adam's, one for each parameter, move one of which nothing is known by its noise as far as the others.) The temperature
-of the smoothing falls from step to step.
+nothing but noise moves one to four parameters by 0.5 to 0.7 of the learning rate where the errors are known from many
+pairs, and by up to 0.6 to 0.9 where they are known from two, in no direction in particular. The learning rate falls by
+a cosine. (Units that an optimiser learns from earlier gradients are those of the first, steep ones, and too large where
+it has to settle; Adam's, one for each parameter, move one of which nothing is known by its noise as far as the others.)
+The temperature of the smoothing falls from step to step.
 
 The derivative of one long run need not say where the mean of many goes: a run's phase of oscillation depends on f times
 its whole length, and its loss ripples with f over less than a tenth of a hertz, steeply. So what is made small is the
@@ -61,7 +61,8 @@ class Schedule(eqx.Module):
     pairs_per_step: int = eqx.field(static=True, default=4)
     """Seeds of each scene that a step averages; each gives a pair of runs."""
     learning_rate: float = eqx.field(converter=number, default=0.4)
-    """How far x goes in the first step if its gradient is sure. Later steps fall to a tenth by a cosine. Positive."""
+    """How far the free numbers go in the first step if its gradient is sure; positive. Later steps fall to a tenth by a
+    cosine."""
     temperature_start: float = eqx.field(converter=number, default=1.0)
     """τ of the smoothing in the first step, in χ² units; positive."""
     temperature_end: float = eqx.field(converter=number, default=0.25)

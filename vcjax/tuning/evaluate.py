@@ -42,6 +42,9 @@ from vcjax.tuning.blocks import (
 )
 from vcjax.tuning.losses import Objective, camera_motion_m2_s2
 
+ALL = "all scenes"
+"""What the scenes are called together; none of them may be called so."""
+
 
 def evaluate(
     scenarios: Mapping[str, Scenario],
@@ -110,7 +113,8 @@ def stacked(scenarios: Mapping[str, Scenario], owner: str = "evaluate") -> Scena
     """Scenes as one, with a leading axis.
 
     Raises:
-        ValueError: naming the owner; if there is none, one is a batch, or they differ in more than numbers.
+        ValueError: naming the owner; if there is none, one is a batch or has no name of its own, or they differ in more
+            than numbers.
     """
     remedy = "give at least one scene by its name, a mapping."
     require_kind(owner, "scenarios", scenarios, Mapping, remedy)
@@ -118,11 +122,16 @@ def stacked(scenarios: Mapping[str, Scenario], owner: str = "evaluate") -> Scena
         raise ValueError(f"{owner}(scenarios={{}}): {remedy}")
     for name, scenario in scenarios.items():
         label = f"scenarios[{name!r}]"
+        if not isinstance(name, str) or name == ALL:
+            raise ValueError(f"{owner}, {label}: give each scene a name, a text other than {ALL!r}.")
         require_kind(owner, label, scenario, Scenario, "give a Scenario, e.g. vcjax.scenarios.paper().")
         require_single(f"{owner}, {label}", scenario)
     shapes = {(jax.tree.structure(s), tuple(np.shape(leaf) for leaf in jax.tree.leaves(s))) for s in scenarios.values()}
     if len(shapes) > 1:
-        raise ValueError("scenarios differ in more than numbers; give all as many frames and features.")
+        raise ValueError(
+            "scenarios differ in more than numbers; give all as many frames, features and movers, and all a course of "
+            "as many legs or none."
+        )
     return jax.tree.map(lambda *leaves: np.stack(leaves), *scenarios.values())
 
 
@@ -187,7 +196,7 @@ def _run_block(scenarios, config, columns, objective: Objective, num_seeds: int,
         map_full_frames=runs.map_full_frames,
         track_score=roc.track_scores(runs),
         is_deleted=(runs.first_deleted > 0) & runs.is_finite,
-        is_moving=runs.is_moving.isel(setting=0, seed=0),
+        is_moving=runs.is_moving.isel(seed=0),
     )
     coordinates: dict[str, Any] = {path: ("setting", values) for path, values in columns.items()}
     return figures.assign_coords(coordinates | {"scene": list(scenarios), "seed": np.arange(num_seeds)})

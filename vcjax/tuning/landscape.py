@@ -16,6 +16,7 @@ from vcjax.tuning.choice import Choice, Seeds, Setting, choose, over_scenes, set
 from vcjax.tuning.evaluate import as_numbers, evaluate
 from vcjax.tuning.intervals import Interval
 from vcjax.tuning.losses import Objective
+from vcjax.tuning.problem import require_movers
 
 
 def search(
@@ -42,7 +43,8 @@ def search(
         progress: called with what is done, and how many settings of how many.
 
     Raises:
-        ValueError: for arguments that make no sense, before anything compiles.
+        ValueError: for arguments that make no sense, such as a scene without movers where these are what the objective
+            is about, before anything compiles.
         OSError: if the directory cannot be written.
         ModuleNotFoundError: if xarray is not installed.
     """
@@ -50,13 +52,16 @@ def search(
     require_key("search", key)
     values = _axes(axes)
     before = setting_of(scenarios, config, list(values))
+    objective = Objective() if objective is None else objective
+    require_kind("search", "objective", objective, Objective, "give an Objective, e.g. Objective(position=2.0).")
+    require_movers("search", scenarios, objective)
     grid = np.stack([axis.ravel() for axis in np.meshgrid(*values.values(), indexing="ij")], axis=1)
     candidates = [before, *(dict(zip(values, point.tolist(), strict=True)) for point in grid)]
     return choose(
         scenarios,
         config,
         candidates,
-        objective=Objective() if objective is None else objective,
+        objective=objective,
         seeds=Seeds() if seeds is None else seeds,
         key=key,
         directory=as_directory("search", directory),

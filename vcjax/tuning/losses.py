@@ -4,7 +4,7 @@ All are finite with finite derivatives for every run that is, whatever was seen,
 they are taken of (see `gates.surrogates`): a true gradient of a soft run, a declared one of a straight-through run,
 none through the verdicts of a hard run. `p` is the degree p_dynamic to which a candidate of a frame is called dynamic;
 of a track, seen in several frames, it is 1 - (1 - p_detector) Π (1 - p): called so at least once, or by the detector.
-Whose statistic hardly changes from one frame to the next, so that its largest p_detector counts, once. Of a hard or
+As a detector's statistic hardly changes from one frame to the next, only its largest p_detector counts. Of a hard or
 straight-through run the losses of the tracks are those of the features deleted.
 
 A degree nearer than 1e-9 to 0 or 1 counts as that near where its logarithm is taken. So of a straight-through run,
@@ -134,6 +134,8 @@ def camera_motion_m2_s2(scenario: Scenario) -> Float[Array, ""]:
     return 0.5 * (2.0 * jnp.pi * jnp.asarray(f) * A) ** 2
 
 
+OF_MOVERS = ("track_f1", "candidate_f1", "track_ranking")
+"""Losses that are the same where nothing moves, whatever is called dynamic."""
 SHAPES = ("mover_weight", "ranking_temperature")
 """Fields of an objective that are no weights of losses."""
 

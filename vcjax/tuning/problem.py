@@ -1,7 +1,8 @@
 """What is tuned: an objective of runs in some scenes, as a function of free numbers."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from vcjax.simulation.scenarios import Scenario
 from vcjax.study.sweep import Experiment, replace_at, require_paths
 from vcjax.tuning.evaluate import stacked
 from vcjax.tuning.intervals import Interval
-from vcjax.tuning.losses import Objective
+from vcjax.tuning.losses import OF_MOVERS, Objective
 
 MAX_AMPLITUDE_M = 0.5
 """How far a camera on a robot can be thought to swing to either side, m."""
@@ -77,7 +78,8 @@ def problem_of(
     Raises:
         ValueError: for hard decisions, losses of them that have no derivative by mistakes, scenes that differ in
             structure, unknown paths, intervals with an end that scenario or configuration refuse, such as a frequency
-            that the frame rate cannot show, or amplitudes above `MAX_AMPLITUDE_M`.
+            that the frame rate cannot show, amplitudes above `MAX_AMPLITUDE_M`, or scenes without movers where these
+            are what the objective is about.
     """
     scenes = stacked(scenarios, "tune")
     require_kind("tune", "config", config, FilterConfig, "give a FilterConfig with smoothing='soft'.")
@@ -113,9 +115,26 @@ def problem_of(
                 f"tune(parameters[{path!r}]) from {interval.low:g} to {interval.high:g}: A is a swing of the camera, "
                 f"between 0 and {MAX_AMPLITUDE_M} m."
             )
+    _require_corners(experiments, parameters)
     config = dataclasses.replace(config, reverse_mode=len(parameters) > FORWARD_MODE_UP_TO)
     objective = Objective() if objective is None else objective
+    require_movers("tune", scenarios, objective)
     return Problem(scenes, config, objective, tuple(parameters), tuple(parameters.values()))
+
+
+def require_movers(owner: str, scenarios: Mapping[str, Scenario], objective: Objective) -> None:
+    """Refuse a scene where nothing moves if something is wanted that is the same there whatever is called dynamic.
+
+    Raises:
+        ValueError: naming scene and weight.
+    """
+    for name, scenario in scenarios.items():
+        wanted = [loss for loss in OF_MOVERS if np.any(getattr(objective, loss) != 0)]
+        if wanted and not (len(scenario.movers.ids) and np.any(scenario.movers.speed_m_s != 0)):
+            raise ValueError(
+                f"{owner}(scenarios[{name!r}]): nothing moves there, so that {', '.join(wanted)} is the same whatever "
+                "is called dynamic; leave the scene out, or weigh track_cross_entropy or candidate_cross_entropy."
+            )
 
 
 def _require_ends(experiment: Experiment, path: str, interval: Interval) -> None:
@@ -130,3 +149,20 @@ def _require_ends(experiment: Experiment, path: str, interval: Interval) -> None
             replace_at(experiment, {path: end})
         except ValueError as error:
             raise ValueError(f"tune(parameters[{path!r}]) from {low:g} to {high:g}: {error}") from None
+
+
+def _require_corners(experiments: Sequence[Experiment], parameters: Mapping[str, Interval]) -> None:
+    """Refuse intervals each of which is right, but not any two of them together, such as of f and of the frame rate.
+
+    Raises:
+        ValueError: naming both, and what is wrong with the pair.
+    """
+    for one, other in itertools.combinations(parameters, 2):
+        ends = ((interval.low, interval.high) for interval in (parameters[one], parameters[other]))
+        for values, experiment in itertools.product(itertools.product(*ends), experiments):
+            pair = dict(zip((one, other), values, strict=True))
+            try:
+                replace_at(experiment, pair)
+            except ValueError as error:
+                told = ", ".join(f"{path} = {value:g}" for path, value in pair.items())
+                raise ValueError(f"tune(parameters), where {told}: {error}") from None

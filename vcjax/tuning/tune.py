@@ -258,7 +258,7 @@ class _KeptSteps(NamedTuple):
         if not self.path.is_file():
             return []
         try:
-            content = json.loads(self.path.read_text())
+            content = json.loads(self.path.read_text("utf-8"))
             found, steps = content["origin"] | {"start": content["start"]}, content["steps"]
             if not isinstance(steps, list | None):
                 raise TypeError("steps are a list")
