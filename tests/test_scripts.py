@@ -1,12 +1,12 @@
 """Scripts that read what commands wrote: what they pair and compare, and what they refuse."""
 
-import importlib.util
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_runs import fake_runs, with_failed_seed
+from loaded_script import script
 from scipy import stats
 
 from vcjax.simulation.scenarios import HARDER
@@ -15,16 +15,6 @@ from vcjax.study.paper import Cell
 from vcjax.study.results import SCHEMA, save
 
 MOVING = Cell(4, "forward", "lateral", 1.0, "VC", True)
-
-
-def script(name: str):
-    """A script as a module."""
-    path = Path(__file__).parents[1] / "scripts" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def written(directory: Path, scene: Scene, num_seeds: int, error_cm: float) -> None:

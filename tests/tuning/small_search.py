@@ -1,9 +1,12 @@
 """A search and a tuning that are small: two scenes of eight frames, two thresholds."""
 
 import functools
+from collections.abc import Mapping, Sequence
 
 import jax
+import numpy as np
 import tiny_runs
+import xarray as xr
 
 from vcjax.tuning.choice import Choice, Seeds
 from vcjax.tuning.intervals import Interval
@@ -23,3 +26,11 @@ SEEDS = Seeds(2, 3)
 def grid_search() -> Choice:
     """Six points of a grid and the setting before; made once."""
     return search(SCENES, SOFT, {TH1: [0.5, 4.0], TH2: [0.4, 1.0, 6.0]}, objective=OBJECTIVE, seeds=SEEDS, key=KEY)
+
+
+def invented_runs(found: Choice, columns: Mapping[str, Sequence[float] | np.ndarray], num_seeds: int) -> xr.Dataset:
+    """Runs of a choice as if they were of other settings and as many seeds."""
+    made, number = found.held_out, len(next(iter(columns.values())))
+    runs = made.isel(setting=np.zeros(number, int), seed=np.arange(num_seeds) % made.sizes["seed"])
+    runs = runs.drop_vars([TH1, TH2]).assign_coords(setting=np.arange(number), seed=np.arange(num_seeds))
+    return runs.assign_coords({path: ("setting", np.asarray(values)) for path, values in columns.items()})

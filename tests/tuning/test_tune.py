@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy import stats
-from small_search import INTERVALS, KEY, OBJECTIVE, SCENES, SEEDS, SOFT, TH1, TH2, grid_search
+from small_search import INTERVALS, KEY, OBJECTIVE, SCENES, SEEDS, SOFT, TH1, TH2, grid_search, invented_runs
 
 from vcjax.tuning import descent
 from vcjax.tuning import evaluate as evaluate_module
@@ -171,7 +171,4 @@ def test_where_the_parameters_are_an_objective_that_is_not_finite_is_an_error(mo
 
 
 def invented_block(found: Choice, scenarios, config, columns, objective, num_seeds, key) -> xr.Dataset:
-    """Runs that were made already, under other settings and as many seeds."""
-    number = len(next(iter(columns.values())))
-    runs = found.held_out.isel(setting=np.zeros(number, int), seed=np.arange(num_seeds)).drop_vars([TH1, TH2])
-    return runs.assign_coords({path: ("setting", values) for path, values in columns.items()})
+    return invented_runs(found, columns, num_seeds)
