@@ -135,7 +135,7 @@ def test_sweep_draws_a_grid_over_any_two_numbers(tmp_path, capsys):
             ["amplitude_m: give --x-range"],
         ),
         (["sweep", "--speeds-m-s", "0", "1"], ["'lateral, 0 m/s'", "nothing moves there", "track_f1 is the same"]),
-        (["tune", "thresholds", "--speeds-m-s", "0", "1"], ["nothing moves there", "track_cross_entropy"]),
+        (["tune", "thresholds", "--speeds-m-s", "0", "1"], ["nothing moves there", "leave the scene out"]),
         (["sweep", "--seeds", "0"], ["choosing=0"]),
         (
             ["sweep", "--y", "scenario.oscillation.frequency_hz", "--y-range", "1", "9"],

@@ -133,7 +133,7 @@ def require_movers(owner: str, scenarios: Mapping[str, Scenario], objective: Obj
         if wanted and not (len(scenario.movers.ids) and np.any(scenario.movers.speed_m_s != 0)):
             raise ValueError(
                 f"{owner}(scenarios[{name!r}]): nothing moves there, so that {', '.join(wanted)} is the same whatever "
-                "is called dynamic; leave the scene out, or weigh track_cross_entropy or candidate_cross_entropy."
+                "is called dynamic; leave the scene out, or weigh it 0 and a cross entropy more."
             )
 
 
