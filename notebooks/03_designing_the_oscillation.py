@@ -224,8 +224,8 @@ assert np.mean((peak_px > 3) & (peak_px < 8)) > 0.6 and positions_cm[0] < positi
 # displacements as f with the sides exchanged, and 5 Hz, like 0, gives none at all. So a scenario takes frequencies
 # below half of the frame rate. The size of the residual does not depend on f. But the formula holds map and path fixed,
 # and what changes slowly the filter can follow with both. So f should not matter to who is found as long as it is high
-# enough, and so it is: nothing much changes between 1 and 4.5 Hz. At 0.1 Hz, one and a half swings in a run, the movers
-# hide again.
+# enough, and in this scene nothing much changes between 1 and 4.5 Hz. At 0.1 Hz, one and a half swings in a run, the
+# movers hide again.
 
 # %%
 for frequency_hz in (0.5, 2.0, 3.7):

@@ -55,9 +55,9 @@ def main(study: Study) -> None:
         compared = comparison(Choice(settings[0], setting, runs, runs.isel(setting=[0, i]), {}))
         del compared["runs"]  # nothing was chosen
         text = comparison_markdown(compared)
-        print(f"\n{text}")
         write_json(study.out / f"setting_{i}.json", compared)
         write_file(study.out / f"setting_{i}.md", text.encode())
+        print(f"\n{text}")
 
 
 if __name__ == "__main__":

@@ -136,7 +136,7 @@ def main(study: Study) -> None:
         "held_out_seeds": int(counts.sum()),
         "runs": {"gradient": num_gradient, "grid": found.candidates.loss.size},
     }
-    print(write_json(both / "report.json", report).read_text())
+    print(write_json(both / "report.json", report).read_text("utf-8"))
 
 
 if __name__ == "__main__":

@@ -61,7 +61,7 @@ def main(study: Study) -> None:
     )
     for path in write_tuning(tuned, {}, study.out):
         print(f"wrote {path}")
-    print((study.out / "tune.md").read_text())
+    print((study.out / "tune.md").read_text("utf-8"))
 
 
 if __name__ == "__main__":

@@ -100,6 +100,19 @@ def test_means_of_a_grid_do_not_skip_a_run_that_failed(found):
     assert float(points.position_rmse_cm[0, 0]) == pytest.approx(float(second[0, 0]))
 
 
+def test_means_of_a_grid_are_of_all_seeds_that_have_a_figure(found):
+    """In each scene by itself; a scene that nobody has it in at a point leaves none there."""
+    grid, (first, second) = as_grid(found).copy(deep=True), SCENES
+    area = grid.detection_auc
+    area[:] = 0.5
+    area.loc[{"scene": second}] = [0.7, 0.9]
+    area[0, 0].loc[{"scene": first, "seed": 0}] = np.nan
+    area[0, 1].loc[{"scene": second}] = np.nan
+    expected = np.full((2, 3), 0.65)
+    expected[0, 1] = np.nan
+    np.testing.assert_allclose(means(grid).detection_auc, expected)
+
+
 def test_a_candidate_with_a_run_that_failed_is_not_chosen(found, monkeypatch):
     """Though the mean of its others is the least."""
     best = int(np.argmin(found.candidates.loss.mean(("scene", "seed")).values))
@@ -145,6 +158,11 @@ def test_bad_searches_are_refused(unchecked):
     with pytest.raises(ValueError, match=r"settings\(scenarios=<list>\): give at least one scene"):
         search([tiny_runs.scenario()] * 2, SOFT, {TH1: [1.0], TH2: [1.0]}, key=KEY)
     rest = {"objective": OBJECTIVE, "seeds": SEEDS, "key": KEY}
+    with pytest.raises(ValueError, match=r"choose\(scenarios={}\): give at least one scene"):
+        choose({}, SOFT, [{TH1: 1.0}], directory="anywhere", **rest)
+    speeds = {TH1: [1.0], "scenario.movers.speed_m_s": [0.0, 1.0]}
+    with pytest.raises(ValueError, match=r"search\(scenarios\['one'\]\): nothing moves there"):
+        search({"one": tiny_runs.scenario(dynamic_speed_m_s=1.0)}, SOFT, speeds, key=KEY)
     for candidates in ([], [{TH1: 1.0}, {TH2: 1.0}], [1.0], "best"):
         with pytest.raises(ValueError, match=r"choose\(candidates=.*: give at least one setting, a mapping"):
             choose(SCENES, SOFT, candidates, **rest)  # pyright: ignore[reportArgumentType]

@@ -40,7 +40,7 @@ class Sweep:
     y: str = "config.gate.th2"
     """Second number."""
     y_range: tuple[float, float] | None = None
-    """From where to where."""
+    """The same for the second."""
     y_points: int = 12
     """How many values."""
     y_log: bool = True

@@ -33,8 +33,9 @@ the difference, paired by seed; bold where it excludes zero. *F1* = 2 found / (f
 the features deleted at least once, of the movers that were ever candidates or deleted; *recall at 1 % static* is the
 share of the movers found if the largest margin of each feature, of gate or detector, is compared with the threshold at
 which 1 % of the static ones are called dynamic (tracks of all runs pooled, intervals by bootstrap, from
-{min_seeds} seeds on); *delay* counts the frames from the birth of a mover to its deletion, where it was found, over all
-scenes of the seeds that have one in each; *camera motion* is the mean square speed of the swing, (2πfA)²/2.
+{min_seeds} seeds on); *delay* counts the frames from the birth of a mover to its deletion, where it was found; over
+all scenes a figure is of the seeds that have one in each of them; *camera motion* is the mean square speed of the
+swing, (2πfA)²/2.
 """
 _FAILED = """\
 **{before} seeds before and {after} after have a run that went non-finite in some scene**: they are in no mean over all

@@ -104,6 +104,7 @@ def choose(
     require_kind("choose", "seeds", seeds, Seeds, "give Seeds, e.g. Seeds(choosing=48, held_out=100).")
     (_, choosing_key), (_, held_out_key) = _kinds(seeds, key)
     directory = as_directory("choose", directory)
+    stacked(scenarios, "choose")
     if directory is not None:
         check_directory(directory, scenarios, config, len(candidates), objective=objective, seeds=seeds, key=key)
 
@@ -209,15 +210,23 @@ def by_scene(runs: Any) -> dict[str, Any]:
 
 
 def over_scenes(runs: Any) -> Any:
-    """Every seed's figures over all scenes: means of the scenes in which any of the runs has the figure.
+    """Every seed's figures over all scenes (see `mean_of_scenes`), none where its run failed in any of them."""
+    return mean_of_scenes(without_failed(runs))
 
-    A seed that lacks it in one of these has no mean, as where a run failed or, of delays, no mover was found: the mean
-    of the other scenes would compare them with all.
+
+def without_failed(runs: Any) -> Any:
+    """The figures of seeds whose runs stayed finite in all scenes."""
+    return runs[list(COMPARED)].where(runs.is_finite.all("scene"))
+
+
+def mean_of_scenes(figures: Any) -> Any:
+    """Means over the scenes in which a figure is found at all, NaN where one of these lacks it.
+
+    As of delays, where no mover was found: the mean of the other scenes would be of other scenes than the rest.
     """
-    figures = runs[list(COMPARED)]
     has = figures.notnull()
     is_asked = has.any([dim for dim in has.dims if dim != "scene"])
-    return figures.mean("scene").where((has | ~is_asked).all("scene") & runs.is_finite.all("scene"))
+    return figures.mean("scene").where((has | ~is_asked).all("scene"))
 
 
 def tracks_of(runs: Any) -> dict[str, roc.Tracks]:

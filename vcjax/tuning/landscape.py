@@ -12,7 +12,7 @@ from vcjax.filter.config import FilterConfig
 from vcjax.simulation.scenarios import Scenario
 from vcjax.study.results import import_xarray
 from vcjax.tuning.blocks import as_directory
-from vcjax.tuning.choice import Choice, Seeds, Setting, choose, over_scenes, setting_of
+from vcjax.tuning.choice import Choice, Seeds, Setting, choose, mean_of_scenes, setting_of, without_failed
 from vcjax.tuning.evaluate import as_numbers, evaluate
 from vcjax.tuning.intervals import Interval
 from vcjax.tuning.losses import Objective
@@ -54,7 +54,7 @@ def search(
     before = setting_of(scenarios, config, list(values))
     objective = Objective() if objective is None else objective
     require_kind("search", "objective", objective, Objective, "give an Objective, e.g. Objective(position=2.0).")
-    require_movers("search", scenarios, objective)
+    require_movers("search", scenarios, objective, values.get("scenario.movers.speed_m_s", ()))
     grid = np.stack([axis.ravel() for axis in np.meshgrid(*values.values(), indexing="ij")], axis=1)
     candidates = [before, *(dict(zip(values, point.tolist(), strict=True)) for point in grid)]
     return choose(
@@ -70,11 +70,12 @@ def search(
 
 
 def means(grid: Any) -> Any:
-    """Every figure at every point of a grid: its mean over scenes, then over the seeds that did not fail in any.
+    """Every figure at every point of a grid: its mean over the seeds that did not fail in any scene, then over scenes.
 
-    The `loss` has none where a run failed, as in the choice of the best.
+    NaN where a scene has no seed with the figure; the `loss` where any run failed, as in the choice of the best.
     """
-    return over_scenes(grid).mean("seed").assign(loss=grid.loss.mean(("scene", "seed"), skipna=False))
+    points = mean_of_scenes(without_failed(grid).mean("seed"))
+    return points.assign(loss=grid.loss.mean(("scene", "seed"), skipna=False))
 
 
 def as_grid(choice: Choice) -> Any:

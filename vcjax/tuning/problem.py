@@ -122,15 +122,24 @@ def problem_of(
     return Problem(scenes, config, objective, tuple(parameters), tuple(parameters.values()))
 
 
-def require_movers(owner: str, scenarios: Mapping[str, Scenario], objective: Objective) -> None:
+def require_movers(
+    owner: str, scenarios: Mapping[str, Scenario], objective: Objective, speeds_m_s: Sequence[float] | np.ndarray = ()
+) -> None:
     """Refuse a scene where nothing moves if something is wanted that is the same there whatever is called dynamic.
+
+    Args:
+        owner: who refuses.
+        scenarios: scenes by name.
+        objective: what is wanted.
+        speeds_m_s: speeds that the movers will have as well as their own.
 
     Raises:
         ValueError: naming scene and weight.
     """
     for name, scenario in scenarios.items():
         wanted = [loss for loss in OF_MOVERS if np.any(getattr(objective, loss) != 0)]
-        if wanted and not (len(scenario.movers.ids) and np.any(scenario.movers.speed_m_s != 0)):
+        speeds = np.append(speeds_m_s, scenario.movers.speed_m_s)
+        if wanted and (len(scenario.movers.ids) == 0 or np.any(speeds == 0)):
             raise ValueError(
                 f"{owner}(scenarios[{name!r}]): nothing moves there, so that {', '.join(wanted)} is the same whatever "
                 "is called dynamic; leave the scene out, or weigh it 0 and a cross entropy more."
