@@ -36,7 +36,9 @@ def landscape_figure(
     marks: Mapping[str, Mapping[str, float]] | None = None,
     paths: Sequence[Sequence[Mapping[str, float]]] = (),
 ) -> Figure:
-    """F1, AUC, position error and objective over a grid, means over its scenes and seeds (see `landscape.means`).
+    """F1, AUC, position error and objective over a grid, means over its seeds and scenes (see `landscape.means`).
+
+    White where a scene has no run with the figure.
 
     Args:
         grid: runs (x, y, scene, seed), as from `landscape.as_grid`.
