@@ -4,14 +4,13 @@ import json
 
 import numpy as np
 import pytest
-import xarray as xr
+from invented_choice import SCENES, TH1, TH2, invented_choice
 from scipy import stats
 
 from vcjax.report import tuning as module
 from vcjax.report.comparison import comparison, comparison_markdown
 from vcjax.report.descent import descent_figure
 from vcjax.report.detection_curves import curves_figure, roc_by_scene_figure
-from vcjax.report.landscape import PANELS, landscape_figure
 from vcjax.report.tuning import write_search, write_tuning
 from vcjax.study.results import describe
 from vcjax.tuning.choice import ALL, COMPARED, RECALL, Choice, Seeds
@@ -20,46 +19,10 @@ from vcjax.tuning.landscape import as_grid
 from vcjax.tuning.losses import Objective
 from vcjax.tuning.tune import End, Tuned
 
-TH1, TH2 = "config.gate.th1", "config.gate.th2"
-SCENES = ["lateral, 1 m/s", "inverse forward, 1 m/s"]
-NUM_FEATURES = 12
-
-
-def invented(settings: list[tuple[float, float]], num_seeds: int) -> xr.Dataset:
-    """Runs as `evaluate` gives them: noise shared by the settings, of which the later ones are better."""
-    rng = np.random.default_rng(0)
-    dims, shape = ("setting", "scene", "seed"), (len(settings), len(SCENES), num_seeds)
-    shared, better = rng.normal(size=shape[1:]), np.arange(len(settings))[:, None, None]
-    own = 0.1 * rng.normal(size=shape)
-    figures = {name: (dims, 5.0 + shared - 0.5 * better + own) for name in COMPARED}
-    figures["detection_delay_frames"] = (dims, np.where(own > 0.1, np.nan, 3.0 + own))
-    is_moving = np.zeros((len(SCENES), NUM_FEATURES), bool)
-    is_moving[:, :4] = True
-    margin = rng.normal(size=(*shape, NUM_FEATURES)) + is_moving[:, None] * (1 + better[..., None])
-    return xr.Dataset(
-        figures
-        | {
-            "is_finite": (dims, np.ones(shape, bool)),
-            "map_full_frames": (dims, np.zeros(shape, int)),
-            "track_score": ((*dims, "feature"), margin),
-            "is_moving": (("scene", "feature"), is_moving),
-        },
-        {
-            "setting": np.arange(len(settings)),
-            "scene": SCENES,
-            "seed": np.arange(num_seeds),
-            TH1: ("setting", [th1 for th1, _ in settings]),
-            TH2: ("setting", [th2 for _, th2 in settings]),
-        },
-    )
-
 
 @pytest.fixture(scope="module")
 def choice() -> Choice:
-    points = [(9.0, 9.0), *((a, b) for a in (4.0, 8.0, 16.0) for b in (3.0, 9.0, 27.0))]
-    before, after = ({TH1: th1, TH2: th2} for th1, th2 in (points[0], points[-1]))
-    origin = {"vcjax": "0", "objective": describe(Objective(position=2.0)), "seeds": describe(Seeds(3, 30))}
-    return Choice(before, after, invented(points, 3), invented([points[0], points[-1]], 30), origin)
+    return invented_choice()
 
 
 def test_means_and_paired_intervals_are_those_of_scipy(choice):
@@ -215,12 +178,6 @@ def test_one_seed_is_called_one(choice):
     assert "Hard decisions, 1 seed held out" in one
 
 
-def test_a_mark_outside_of_the_grid_is_said_to_be_there(choice):
-    for th1, label in ((9.0, "before"), (9e3, "before: outside")):
-        figure = landscape_figure(as_grid(choice), "title", {"before": choice.before | {TH1: th1}})
-        assert [text.get_text() for text in figure.legends[0].get_texts()] == [label]
-
-
 def test_search_and_tuning_are_written_whole(choice, tmp_path):
     paths = write_search(choice, tmp_path / "sweep")
     assert all(path.is_file() and path.stat().st_size > 0 for path in paths)
@@ -282,21 +239,3 @@ def test_search_and_tuning_are_written_whole(choice, tmp_path):
     assert {"before", "after", "history", "paired"} <= set(content)
     figures = {path.name for path in paths if path.suffix == ".png"}
     assert figures == {"descent.png", "landscape_thresholds.png", "curves.png", "roc_by_scene.png"}
-
-
-def test_the_landscape_shows_every_mean_in_its_place(choice):
-    grid = as_grid(choice)
-    figure = landscape_figure(grid, "title", {"before": choice.before, "after": choice.after}, [[choice.before] * 2])
-    for axes, name in zip(figure.axes, PANELS, strict=False):
-        (mesh,) = axes.collections
-        np.testing.assert_allclose(mesh.get_array(), grid[name].mean(("scene", "seed")).T)
-        corners = mesh.get_coordinates()
-        np.testing.assert_allclose(corners[0, 0], [4 / np.sqrt(2), 3 / np.sqrt(3)])
-        np.testing.assert_allclose(corners[-1, -1], [16 * np.sqrt(2), 27 * np.sqrt(3)])
-        assert axes.get_xscale() == axes.get_yscale() == "log"
-    linear = grid.assign_coords({TH1: [1.0, 2.0, 3.0]})
-    assert landscape_figure(linear, "title").axes[0].get_xlim() == (0.5, 3.5)
-    two = landscape_figure(grid.isel({TH1: [0, 2]}).isel({TH2: [1, 2]}), "title").axes[0]
-    assert (two.get_xscale(), two.get_yscale()) == ("log", "linear") and two.get_xlim() == pytest.approx((2, 32))
-    far = grid.isel({TH1: [0, 2]}).assign_coords({TH1: [2.0, 64.0]})
-    assert landscape_figure(far, "title").axes[0].get_xlim() == pytest.approx((2 / 32**0.5, 64 * 32**0.5))

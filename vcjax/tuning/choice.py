@@ -203,15 +203,10 @@ def setting_of(scenarios: Mapping[str, Scenario], config: FilterConfig, paths: S
 
 
 def by_scene(runs: Any) -> dict[str, Any]:
-    """Runs for each scene, and over all scenes (see `over_scenes`)."""
+    """Every seed's figures in each scene, and over all scenes: `mean_of_scenes` of seeds that failed in none."""
     names = [str(name) for name in runs.scene.values]
     scenes = {name: runs.sel(scene=name)[list(COMPARED)] for name in names}
-    return scenes | {ALL: over_scenes(runs)}
-
-
-def over_scenes(runs: Any) -> Any:
-    """Every seed's figures over all scenes (see `mean_of_scenes`), none where its run failed in any of them."""
-    return mean_of_scenes(without_failed(runs))
+    return scenes | {ALL: mean_of_scenes(without_failed(runs))}
 
 
 def without_failed(runs: Any) -> Any:
